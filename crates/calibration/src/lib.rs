@@ -1,0 +1,1 @@
+//! Pairs to the map from camera to robot: plan, fit, apply, report.

@@ -1,0 +1,1 @@
+//! The disassembly program: device traits, capture, planning, outcomes, journal.

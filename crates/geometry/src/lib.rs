@@ -1,0 +1,1 @@
+//! Frames, points, transforms, the camera model, RGB-D frames and their files.

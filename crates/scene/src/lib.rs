@@ -1,0 +1,1 @@
+//! Outdoor units and their pictures: products, wear, renderer, camera, exact truth.

@@ -1,0 +1,1 @@
+//! A simulated cell behind the device traits.

@@ -1,0 +1,2 @@
+//! The `unscrew` command line.
+fn main() {}

@@ -1,0 +1,1 @@
+//! Image to screws: coarse, fine, centre, locate; image to calibration marker.
