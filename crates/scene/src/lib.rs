@@ -1,1 +1,4 @@
-//! Outdoor units and their pictures: products, wear, renderer, camera, exact truth.
+//! Outdoor units and their pictures: procedural products, wear, renderer, camera noise, exact truth.
+
+pub mod fastener;
+pub mod relief;
