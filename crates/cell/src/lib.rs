@@ -1,1 +1,3 @@
-//! The disassembly program: device traits, capture, planning, outcomes, journal.
+//! The disassembly program: device traits and drivers, capture loop, planning, outcomes, journal.
+
+pub mod device;
