@@ -1,0 +1,409 @@
+//! The model file: the coarse network, the three fine ones, and the figures that training measured, in one file.
+//!
+//! `UNSCREW1`, the length of the header (u32, little endian), the header (JSON), then the networks' bytes one after the other, as
+//! the header lists them. Each network is a safetensors file with its own architecture.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use nn::{Network, NnError};
+use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
+
+use crate::layout::{CLIP_PX, COARSE_CHANNELS, FINE_CHANNELS, STRIDE};
+
+const MAGIC: &[u8; 7] = b"UNSCREW";
+/// Version of the container, the eighth byte of the file.
+const VERSION: u8 = b'1';
+/// Bytes before the header.
+const PREAMBLE: usize = 12;
+
+/// The model that ships with the program.
+static EMBEDDED: &[u8] = include_bytes!("../models/default.unscrew");
+
+/// Limits between the verdicts; training sets them from the cost of a miss, a false find and a person's look.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct Thresholds {
+    /// Coarse probability above which a cell belongs to a candidate: low, so that nothing is missed.
+    pub coarse: f32,
+    /// Fewest coarse cells (16 px² each) of a candidate.
+    pub coarse_min_cells: usize,
+    /// Probability of the mounted bit's drive from which the verdict is `screw`.
+    pub accept: f32,
+    /// From this up to `accept` the verdict is `review`; below, the candidate is dropped.
+    pub review: f32,
+    /// Probability of another drive from which the verdict is `other`.
+    pub other: f32,
+}
+
+impl Default for Thresholds {
+    fn default() -> Self {
+        Self {
+            coarse: 0.15,
+            coarse_min_cells: 2,
+            accept: 0.7,
+            review: 0.3,
+            other: 0.5,
+        }
+    }
+}
+
+/// Corrections measured on held-out data that make sigmas and scores mean what they say.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct Corrections {
+    /// True error over stated sigma of the outer circle's centre.
+    pub circle_sigma: f64,
+    /// True error over stated sigma of the cross's centre.
+    pub cross_sigma: f64,
+    /// True error over stated sigma of the learned centre.
+    pub learned_sigma: f64,
+    /// True error over stated sigma of the fused centre.
+    pub fused_sigma: f64,
+    /// True error over stated sigma of the depth at the rim.
+    pub depth_sigma: f64,
+    /// Slope of the score in log odds (Platt 1999).
+    pub score_slope: f64,
+    /// Offset of the score in log odds.
+    pub score_offset: f64,
+}
+
+impl Default for Corrections {
+    fn default() -> Self {
+        Self {
+            circle_sigma: 1.0,
+            cross_sigma: 1.0,
+            learned_sigma: 1.0,
+            fused_sigma: 1.0,
+            depth_sigma: 1.0,
+            score_slope: 1.0,
+            score_offset: 0.0,
+        }
+    }
+}
+
+/// Everything in a model file that is not a network.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Settings {
+    /// Limits between the verdicts.
+    #[serde(default)]
+    pub thresholds: Thresholds,
+    /// What makes sigmas and scores honest.
+    #[serde(default)]
+    pub corrections: Corrections,
+    /// What made the model: data, hashes, seed, date, version, figures on held-out data.
+    #[serde(default)]
+    pub facts: BTreeMap<String, serde_json::Value>,
+}
+
+#[derive(Serialize, Deserialize)]
+struct Header {
+    networks: Vec<Entry>,
+    #[serde(flatten)]
+    settings: Settings,
+}
+
+#[derive(Serialize, Deserialize)]
+struct Entry {
+    name: String,
+    bytes: usize,
+}
+
+/// Why a model cannot be used. Each message names the file and what to do.
+#[derive(Debug, thiserror::Error)]
+pub enum ModelError {
+    /// It cannot be read.
+    #[error("cannot read the model {file}: {source}; check the path, or leave it out to use the built-in model")]
+    Read {
+        /// The file.
+        file: String,
+        /// What the system says.
+        source: std::io::Error,
+    },
+    /// It is something else.
+    #[error("{file} is not an unscrew model; give a file that `unscrew train` wrote")]
+    NotAModel {
+        /// The file.
+        file: String,
+    },
+    /// It was made by another version.
+    #[error("{file} has model format {found:?}, this program reads '1'; update the program, or train the model again")]
+    Version {
+        /// The file.
+        file: String,
+        /// The format's version in the file.
+        found: char,
+    },
+    /// It ends too early or has a wrong length.
+    #[error("{file} is damaged: {found} bytes where its header says {expected}; copy it again from its source")]
+    Length {
+        /// The file.
+        file: String,
+        /// Bytes there.
+        found: usize,
+        /// Bytes that the header asks for.
+        expected: usize,
+    },
+    /// Its header cannot be understood.
+    #[error("the header of the model {file} is damaged ({reason}); copy it again from its source")]
+    Header {
+        /// The file.
+        file: String,
+        /// What is wrong.
+        reason: String,
+    },
+    /// A network in it cannot be used.
+    #[error("network {network} of the model {file}: {source}; train the model again")]
+    Network {
+        /// The file.
+        file: String,
+        /// The network's name.
+        network: String,
+        /// What is wrong.
+        source: NnError,
+    },
+    /// A network in it has another shape than the program expects.
+    #[error("network {network} of the model {file} {reason}; train the model again with this version")]
+    Shape {
+        /// The file.
+        file: String,
+        /// The network's name.
+        network: String,
+        /// How it differs.
+        reason: String,
+    },
+}
+
+/// A detector's networks and settings, ready to run.
+#[derive(Clone, Debug)]
+pub struct Model {
+    /// Stage 1: whole picture to candidates.
+    pub coarse: Network,
+    /// Stage 2: the ensemble whose mean decides (three networks in the paper).
+    pub fine: Vec<Network>,
+    /// Thresholds, corrections, facts.
+    pub settings: Settings,
+    id: String,
+}
+
+impl Model {
+    /// Reads a model file.
+    ///
+    /// # Errors
+    /// A [`ModelError`] that names the file.
+    pub fn load(path: &Path) -> Result<Self, ModelError> {
+        let file = path.display().to_string();
+        match std::fs::read(path) {
+            Ok(bytes) => Self::named(&bytes, &file),
+            Err(source) => Err(ModelError::Read { file, source }),
+        }
+    }
+
+    /// The model that ships with the program.
+    ///
+    /// # Errors
+    /// A [`ModelError`] where the program was built with a damaged file.
+    pub fn embedded() -> Result<Self, ModelError> {
+        Self::named(EMBEDDED, "the built-in model")
+    }
+
+    /// Reads a model from the bytes of its file.
+    ///
+    /// # Errors
+    /// A [`ModelError`].
+    pub fn from_bytes(bytes: &[u8]) -> Result<Self, ModelError> {
+        Self::named(bytes, "given as bytes")
+    }
+
+    fn named(bytes: &[u8], file: &str) -> Result<Self, ModelError> {
+        let (header, mut rest) = split(bytes, file)?;
+        let (mut coarse, mut fine) = (None, Vec::new());
+        for entry in header.networks {
+            let (blob, tail) = rest.split_at(entry.bytes); // `split` checked the sum
+            rest = tail;
+            let network = Network::from_bytes(blob).map_err(|source| ModelError::Network {
+                file: file.into(),
+                network: entry.name.clone(),
+                source,
+            })?;
+            let is_coarse = entry.name == "coarse";
+            let channels = if is_coarse { COARSE_CHANNELS } else { FINE_CHANNELS };
+            check_shape(&network, channels).map_err(|reason| ModelError::Shape {
+                file: file.into(),
+                network: entry.name.clone(),
+                reason,
+            })?;
+            if is_coarse {
+                coarse = Some(network);
+            } else {
+                fine.push(network);
+            }
+        }
+        match coarse {
+            Some(coarse) if !fine.is_empty() => Ok(Self {
+                coarse,
+                fine,
+                settings: header.settings,
+                id: model_id(bytes),
+            }),
+            _ => Err(ModelError::Header {
+                file: file.into(),
+                reason: "it lists no coarse network or no fine one".into(),
+            }),
+        }
+    }
+
+    /// `sha256:` and the hash of the file: names the model in every result.
+    pub fn id(&self) -> &str {
+        &self.id
+    }
+}
+
+/// The bytes of a model file.
+///
+/// # Arguments
+/// * `coarse`, `fine` – the networks as [`nn`] saves them.
+///
+/// # Errors
+/// [`ModelError::Header`] where the header would not fit (4 GiB).
+pub fn encode_model(coarse: &[u8], fine: &[Vec<u8>], settings: &Settings) -> Result<Vec<u8>, ModelError> {
+    let unfit = |reason: String| ModelError::Header {
+        file: "to be written".into(),
+        reason,
+    };
+    let mut networks = vec![Entry {
+        name: "coarse".into(),
+        bytes: coarse.len(),
+    }];
+    networks.extend(fine.iter().enumerate().map(|(i, blob)| Entry {
+        name: format!("fine{i}"),
+        bytes: blob.len(),
+    }));
+    let header = Header {
+        networks,
+        settings: settings.clone(),
+    };
+    let header = serde_json::to_vec(&header).map_err(|e| unfit(e.to_string()))?;
+    let length = u32::try_from(header.len()).map_err(|e| unfit(e.to_string()))?;
+    let mut bytes = MAGIC.to_vec();
+    bytes.push(VERSION);
+    bytes.extend(length.to_le_bytes());
+    bytes.extend(header);
+    bytes.extend(coarse);
+    bytes.extend(fine.iter().flatten());
+    Ok(bytes)
+}
+
+/// The networks' bytes and the settings of a model file, by name: for tools that take it apart.
+///
+/// # Errors
+/// A [`ModelError`] that names `file`.
+pub fn decode_model(bytes: &[u8], file: &str) -> Result<(BTreeMap<String, Vec<u8>>, Settings), ModelError> {
+    let (header, mut rest) = split(bytes, file)?;
+    let mut networks = BTreeMap::new();
+    for entry in header.networks {
+        let (blob, tail) = rest.split_at(entry.bytes);
+        networks.insert(entry.name, blob.to_vec());
+        rest = tail;
+    }
+    Ok((networks, header.settings))
+}
+
+/// `sha256:` and the hash of a model file's bytes.
+pub fn model_id(bytes: &[u8]) -> String {
+    use std::fmt::Write;
+    Sha256::digest(bytes)
+        .iter()
+        .fold(String::from("sha256:"), |mut text, byte| {
+            let _ = write!(text, "{byte:02x}"); // writing to a string cannot fail
+            text
+        })
+}
+
+/// The header, and the networks' bytes, exactly as many as the header lists.
+fn split<'a>(bytes: &'a [u8], file: &str) -> Result<(Header, &'a [u8]), ModelError> {
+    let file = || file.to_owned();
+    if bytes.len() < PREAMBLE || &bytes[..7] != MAGIC {
+        return Err(ModelError::NotAModel { file: file() });
+    }
+    if bytes[7] != VERSION {
+        let found = char::from(bytes[7]);
+        return Err(ModelError::Version { file: file(), found });
+    }
+    let length = u32::from_le_bytes([bytes[8], bytes[9], bytes[10], bytes[11]]) as usize;
+    let wrong_length = |expected| ModelError::Length {
+        file: file(),
+        found: bytes.len(),
+        expected,
+    };
+    let end = PREAMBLE.saturating_add(length);
+    let header = bytes.get(PREAMBLE..end).ok_or_else(|| wrong_length(end))?;
+    let header: Header = serde_json::from_slice(header).map_err(|e| ModelError::Header {
+        file: file(),
+        reason: e.to_string(),
+    })?;
+    let expected = header.networks.iter().fold(end, |sum, e| sum.saturating_add(e.bytes));
+    if expected != bytes.len() {
+        return Err(wrong_length(expected));
+    }
+    Ok((header, &bytes[end..]))
+}
+
+fn check_shape(network: &Network, channels: usize) -> Result<(), String> {
+    let spec = network.spec();
+    if spec.input_channels != 3 || spec.output_channels() != channels {
+        return Err(format!(
+            "has {} input and {} output channels, expected are 3 and {channels}",
+            spec.input_channels,
+            spec.output_channels()
+        ));
+    }
+    let cells = CLIP_PX / STRIDE;
+    if spec.pixel_map() != (STRIDE as f64, 0.0) || spec.output_size(CLIP_PX, CLIP_PX) != (cells, cells) {
+        return Err(format!("does not have one output on every {STRIDE}th pixel"));
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn message(bytes: &[u8]) -> String {
+        Model::named(bytes, "m.unscrew").expect_err("must not load").to_string()
+    }
+
+    #[test]
+    fn the_built_in_model_loads_and_survives_a_round_trip() -> Result<(), ModelError> {
+        let model = Model::embedded()?;
+        assert_eq!(model.fine.len(), 3);
+        assert!(model.id().starts_with("sha256:") && model.id().len() == 71);
+        let (networks, settings) = decode_model(EMBEDDED, "m.unscrew")?;
+        let fine = [0, 1, 2].map(|i| networks[&format!("fine{i}")].clone());
+        let again = encode_model(&networks["coarse"], &fine, &settings)?;
+        assert_eq!(Model::from_bytes(&again)?.settings, model.settings);
+        assert_eq!(model_id(&again).len(), 71);
+        Ok(())
+    }
+
+    #[test]
+    fn what_is_no_model_says_so_and_names_the_file() {
+        assert!(message(b"").contains("m.unscrew is not an unscrew model"));
+        assert!(message(b"PNG, or some text that is long enough").contains("not an unscrew model"));
+        let mut other = EMBEDDED.to_vec();
+        other[7] = b'9';
+        assert!(message(&other).contains("format '9'"));
+        assert!(message(&EMBEDDED[..EMBEDDED.len() - 1]).contains("m.unscrew is damaged"));
+        assert!(message(&EMBEDDED[..20]).contains("m.unscrew is damaged"));
+        let mut scrambled = EMBEDDED.to_vec();
+        scrambled[PREAMBLE] = b'?';
+        assert!(message(&scrambled).contains("header of the model m.unscrew"));
+        let (mut networks, settings) = decode_model(EMBEDDED, "m").expect("the built-in model");
+        let coarse = networks.remove("coarse").expect("a coarse network");
+        let swapped = encode_model(&coarse, std::slice::from_ref(&coarse), &settings).expect("fits");
+        assert!(message(&swapped).contains("network fine0 of the model m.unscrew has 3 input and 2 output channels"));
+        let missing = Model::load(Path::new("/nowhere/m.unscrew")).expect_err("is not there");
+        assert!(missing.to_string().contains("/nowhere/m.unscrew"));
+    }
+}
