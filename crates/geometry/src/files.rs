@@ -1,7 +1,7 @@
 //! Files: colour (PNG, JPEG, TIFF), depth (16-bit PNG, float TIFF), ROS `camera_info`; written aside, then renamed.
 
 use crate::{CameraModel, DepthMap, RgbdFrame};
-use image::{ColorType, DynamicImage, ImageDecoder, ImageReader, RgbImage, codecs::jpeg::JpegEncoder};
+use image::{DynamicImage, ImageDecoder, ImageReader, RgbImage, codecs::jpeg::JpegEncoder};
 use serde::Deserialize;
 use std::{
     fs,
@@ -128,23 +128,16 @@ pub fn read_color(path: &Path) -> Result<RgbImage, FileError> {
 /// # Errors
 /// [`FileError::Depth`] for another kind of picture, [`FileError::DepthSize`] if it does not belong to `color_size` (columns, rows).
 pub fn read_depth(path: &Path, scale_mm: f64, color_size: (u32, u32)) -> Result<DepthMap, FileError> {
-    let picture = decode(path)?;
-    let (width, height) = (picture.width(), picture.height());
-    let scale = scale_mm as f32;
-    let clean = |z: f32| if z.is_finite() && z > 0.0 { z * scale } else { 0.0 };
-    let depth_mm = match (&picture, picture.color()) {
-        (DynamicImage::ImageLuma16(p), _) => p.as_raw().iter().map(|&z| clean(f32::from(z))).collect(),
-        (_, ColorType::Rgb32F) => {
-            // the TIFF decoder widens one float channel to three equal ones
-            picture.to_rgb32f().pixels().map(|p| clean(p.0[0])).collect()
-        }
-        (_, other) => {
-            return Err(FileError::Depth {
-                path: path.into(),
-                reason: format!("its pixels are {other:?}"),
-            });
-        }
+    let (width, height, raw) = if is_tiff(path)? {
+        decode_float_tiff(path)?
+    } else {
+        decode_grey16(path)?
     };
+    let scale = scale_mm as f32;
+    let depth_mm = raw
+        .into_iter()
+        .map(|z| if z.is_finite() && z > 0.0 { z * scale } else { 0.0 })
+        .collect();
     let step = DepthMap::step_between(color_size, (width, height)).ok_or_else(|| FileError::DepthSize {
         path: path.into(),
         depth_width: width,
@@ -158,6 +151,47 @@ pub fn read_depth(path: &Path, scale_mm: f64, color_size: (u32, u32)) -> Result<
         step,
         depth_mm,
     })
+}
+
+fn is_tiff(path: &Path) -> Result<bool, FileError> {
+    let bytes = bytes(path)?;
+    Ok(bytes.starts_with(b"II*\0") || bytes.starts_with(b"MM\0*"))
+}
+
+fn decode_grey16(path: &Path) -> Result<(u32, u32, Vec<f32>), FileError> {
+    match decode(path)? {
+        DynamicImage::ImageLuma16(p) => Ok((
+            p.width(),
+            p.height(),
+            p.as_raw().iter().map(|&z| f32::from(z)).collect(),
+        )),
+        other => Err(FileError::Depth {
+            path: path.into(),
+            reason: format!("its pixels are {:?}", other.color()),
+        }),
+    }
+}
+
+/// Grey float TIFF: the `image` crate reads colour only, so its own decoder is asked.
+fn decode_float_tiff(path: &Path) -> Result<(u32, u32, Vec<f32>), FileError> {
+    let bad = |reason: String| FileError::Depth {
+        path: path.into(),
+        reason,
+    };
+    let mut decoder =
+        tiff::decoder::Decoder::new(std::io::Cursor::new(bytes(path)?)).map_err(|e| bad(e.to_string()))?;
+    let (width, height) = decoder.dimensions().map_err(|e| bad(e.to_string()))?;
+    let pixels = width as usize * height as usize;
+    let raw: Vec<f32> = match decoder.read_image().map_err(|e| bad(e.to_string()))? {
+        tiff::decoder::DecodingResult::F32(z) => z,
+        tiff::decoder::DecodingResult::F64(z) => z.into_iter().map(|z| z as f32).collect(),
+        tiff::decoder::DecodingResult::U16(z) => z.into_iter().map(f32::from).collect(),
+        _ => return Err(bad("its pixels are neither float nor 16 bit".into())),
+    };
+    if raw.len() != pixels {
+        return Err(bad(format!("it has {} channels, not one", raw.len() / pixels.max(1))));
+    }
+    Ok((width, height, raw))
 }
 
 /// Reads a whole shot: colour, and depth and camera where given.
