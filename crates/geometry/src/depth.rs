@@ -166,15 +166,6 @@ fn through([a, b, c]: &[[f64; 3]; 3]) -> Option<[f64; 3]> {
 }
 
 impl DepthMap {
-    /// Checks that the map belongs to a colour picture of this size: equal, or smaller by the integer factor `step`.
-    pub fn matches(&self, width_px: u32, height_px: u32) -> bool {
-        self.step >= 1
-            && self.width == width_px.div_ceil(self.step).min(width_px / self.step + 1)
-            && (self.width == width_px / self.step || self.width == width_px.div_ceil(self.step))
-            && (self.height == height_px / self.step || self.height == height_px.div_ceil(self.step))
-            && self.depth_mm.len() == self.width as usize * self.height as usize
-    }
-
     /// The integer factor between a colour and a depth size, `None` if there is none.
     pub fn step_between(color: (u32, u32), depth: (u32, u32)) -> Option<u32> {
         (1..=8).find(|s| {
