@@ -297,6 +297,22 @@ pub trait PlantLink: Send + Sync {
 pub trait Clock: Send + Sync {
     /// Seconds since the cell was switched on.
     fn now_s(&self) -> f64;
+    /// Lets the time pass that is budgeted for computing. A simulated clock moves on by it (so that a run does not depend on
+    /// the machine that computes it); on a real clock that time has passed by itself.
+    fn pass(&self, _budget_s: f64) {}
+}
+
+/// Jobs that are stored on the arms' controllers and that the program starts by name.
+pub mod jobs {
+    /// Clear of the table and of the camera's view.
+    pub const HOME: &str = "HOME";
+    /// Grips a cover and pulls it with bounded force. Ends in any case: [`GRIPPER_HOLDING`](super::tags::GRIPPER_HOLDING)
+    /// says afterwards whether the cover came off (true) or stayed (false). `PULL_TOP`, `PULL_FRONT`, `PULL_RIGHT`.
+    pub fn pull(cover: &str) -> String {
+        format!("PULL_{}", cover.to_uppercase())
+    }
+    /// Lays the held cover aside; the gripper is empty afterwards.
+    pub const DROP: &str = "DROP";
 }
 
 /// A robot arm with its place in the cell.
