@@ -10,7 +10,7 @@
 //! ```
 //! use nn::{LayerSpec, Spec, Tensor, Trainer, softmax_cross_entropy};
 //!
-//! let conv = |stride, out, last| LayerSpec::Conv {
+//! let conv = |stride, out, last: bool| LayerSpec::Conv {
 //!     kernel: 3, stride, dilation: 1, out, batch_norm: !last, relu: !last,
 //! };
 //! let spec = Spec { input_channels: 3, layers: vec![conv(2, 8, false), conv(1, 2, true)] };
@@ -44,3 +44,6 @@ pub use network::Network;
 pub use spec::{LayerSpec, Spec};
 pub use tensor::{RowSource, Tensor};
 pub use train::Trainer;
+
+#[cfg(test)]
+mod tests;

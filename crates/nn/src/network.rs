@@ -136,7 +136,7 @@ impl Network {
         self.forward_strips(source, h.div_ceil(strips), h, w)
     }
 
-    fn forward_strips(&self, source: &dyn RowSource, rows: usize, h: usize, w: usize) -> Tensor {
+    pub(crate) fn forward_strips(&self, source: &dyn RowSource, rows: usize, h: usize, w: usize) -> Tensor {
         self.check_input(source.height(), source.width(), source.channels());
         let mut output = Tensor::zeros(1, h, w, self.spec.output_channels());
         output

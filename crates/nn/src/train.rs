@@ -696,6 +696,32 @@ impl Trainer {
         Ok(trainer)
     }
 
+    /// For tests: values and gradients of all parameters, convolution by convolution, as in files.
+    #[cfg(test)]
+    pub(crate) fn flat(&self) -> (Vec<f32>, Vec<f32>) {
+        let (mut values, mut gradients) = (Vec::new(), Vec::new());
+        for (index, layer) in self.layers.iter().enumerate() {
+            let Layer::Conv(conv) = layer else { continue };
+            let (inputs, outputs) = (self.channels[index], self.channels[index + 1]);
+            for (name, parameter) in conv.parameters() {
+                for (to, from) in [(&mut values, &parameter.value), (&mut gradients, &parameter.gradient)] {
+                    to.extend(if name == "weight" {
+                        unpack(&conv.geometry, inputs, outputs, from)
+                    } else {
+                        from[..outputs].to_vec()
+                    });
+                }
+            }
+        }
+        (values, gradients)
+    }
+
+    /// For tests: as on a processor of that level.
+    #[cfg(test)]
+    pub(crate) fn set_level(&mut self, level: Level) {
+        self.level = level;
+    }
+
     fn entries(&self) -> Vec<Entry> {
         let mut entries = Vec::new();
         let mut parameters = self.parameters().into_iter();
