@@ -1,0 +1,169 @@
+//! How fast this machine runs and trains networks of the size that the detector uses.
+//!
+//! ```sh
+//! cargo run --release -p nn --example throughput
+//! ```
+
+use std::hint::black_box;
+use std::time::Instant;
+
+use nn::{LayerSpec, RowSource, Spec, Tensor, Trainer};
+use rayon::prelude::*;
+
+fn conv(kernel: usize, stride: usize, dilation: usize, out: usize) -> LayerSpec {
+    LayerSpec::Conv {
+        kernel,
+        stride,
+        dilation,
+        out,
+        batch_norm: true,
+        relu: true,
+    }
+}
+
+/// A picture that costs nothing to read.
+struct Grey(usize, usize, usize);
+
+impl RowSource for Grey {
+    fn height(&self) -> usize {
+        self.0
+    }
+    fn width(&self) -> usize {
+        self.1
+    }
+    fn channels(&self) -> usize {
+        self.2
+    }
+    fn row(&self, y: usize, out: &mut [f32]) {
+        out.fill(y as f32 * 1e-3);
+    }
+}
+
+/// Seconds of the fastest of several runs.
+fn fastest(runs: usize, mut work: impl FnMut()) -> f64 {
+    (0..runs)
+        .map(|_| {
+            let start = Instant::now();
+            work();
+            start.elapsed().as_secs_f64()
+        })
+        .fold(f64::INFINITY, f64::min)
+}
+
+/// Fused multiplications and additions that depend on nothing but themselves: operations done.
+fn multiply_add(steps: usize) -> u64 {
+    #[cfg(target_arch = "x86_64")]
+    {
+        use std::arch::x86_64::*;
+        #[target_feature(enable = "avx512f")]
+        fn wide(steps: usize) {
+            let mut sums = [_mm512_set1_ps(black_box(0.1)); 16];
+            let factor = _mm512_set1_ps(black_box(0.9));
+            for _ in 0..steps {
+                for sum in &mut sums {
+                    *sum = _mm512_fmadd_ps(*sum, factor, factor);
+                }
+            }
+            black_box(sums);
+        }
+        #[target_feature(enable = "avx2,fma")]
+        fn narrow(steps: usize) {
+            let mut sums = [_mm256_set1_ps(black_box(0.1)); 12];
+            let factor = _mm256_set1_ps(black_box(0.9));
+            for _ in 0..steps {
+                for sum in &mut sums {
+                    *sum = _mm256_fmadd_ps(*sum, factor, factor);
+                }
+            }
+            black_box(sums);
+        }
+        // SAFETY: each is called only where the processor has its instructions.
+        if is_x86_feature_detected!("avx512f") {
+            unsafe { wide(steps) };
+            return 16 * 16 * 2 * steps as u64;
+        } else if is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma") {
+            unsafe { narrow(steps) };
+            return 12 * 8 * 2 * steps as u64;
+        }
+    }
+    let mut sums = [black_box(0.1f32); 32];
+    for _ in 0..steps {
+        for sum in &mut sums {
+            *sum = *sum * 0.9 + 0.9;
+        }
+    }
+    black_box(sums);
+    32 * 2 * steps as u64
+}
+
+fn main() {
+    let threads = rayon::current_num_threads();
+    let mut operations = 0;
+    let seconds = fastest(20, || {
+        operations = (0..threads).into_par_iter().map(|_| multiply_add(1 << 20)).sum();
+    });
+    let peak = operations as f64 / seconds / 1e9;
+    println!("{threads} threads, {peak:.0} GFLOP/s of multiplications and additions");
+
+    println!("inference, 1503 x 2052 pixels");
+    let layers = |channels: usize, count: usize| vec![conv(3, 1, 1, channels); count];
+    let mut cases: Vec<(String, Spec, usize, usize)> = [16, 24, 32, 48, 64]
+        .into_iter()
+        .map(|c| {
+            let spec = Spec {
+                input_channels: c,
+                layers: layers(c, 2),
+            };
+            (format!("2 x 3x3, {c} channels"), spec, 1503 / 2, 2052 / 2)
+        })
+        .collect();
+    let mut detector = vec![conv(3, 2, 1, 16), conv(3, 2, 1, 32)];
+    detector.extend([1, 1, 2, 1].map(|dilation| conv(3, 1, dilation, 32)));
+    detector.push(LayerSpec::Conv {
+        kernel: 1,
+        stride: 1,
+        dilation: 1,
+        out: 11,
+        batch_norm: false,
+        relu: false,
+    });
+    let detector = Spec {
+        input_channels: 3,
+        layers: detector,
+    };
+    cases.push(("detector, 3 channels".into(), detector.clone(), 1503, 2052));
+    for (name, spec, h, w) in cases {
+        let network = Trainer::new(spec.clone(), 1).network();
+        let source = Grey(h, w, spec.input_channels);
+        let seconds = fastest(8, || {
+            black_box(network.forward(&source));
+        });
+        let rate = spec.flops(h, w) as f64 / seconds / 1e9;
+        let (share, ms) = (100.0 * rate / peak, 1e3 * seconds);
+        println!("  {name:24} {h:5} x {w:4} {ms:8.1} ms {rate:6.0} GFLOP/s {share:4.0} %");
+    }
+
+    println!("training, batch 128 of 64 x 64 x 3");
+    let mut trainer = Trainer::new(detector.clone(), 1);
+    let mut batch = Tensor::zeros(128, 64, 64, 3);
+    for (i, value) in batch.data.iter_mut().enumerate() {
+        *value = (i * 7919 % 1013) as f32 / 1013.0 - 0.5;
+    }
+    let mut output = trainer.forward(&batch);
+    output.data.fill(1e-3);
+    let forward = fastest(15, || {
+        black_box(trainer.forward(&batch));
+    });
+    let step = fastest(15, || {
+        black_box(trainer.forward(&batch));
+        trainer.backward(&output);
+        trainer.adam_step(1e-3, 0.0);
+    });
+    let rate = 3.0 * 128.0 * detector.flops(64, 64) as f64 / step / 1e9;
+    println!(
+        "  {:.0} images/s ({:.1} ms forward, {:.1} ms in all, about {rate:.0} GFLOP/s)",
+        128.0 / step,
+        1e3 * forward,
+        1e3 * step,
+    );
+}
