@@ -185,6 +185,7 @@ pub trait RobotArm: Send + Sync {
 
 /// A bounded programme of the driver.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct DriveProgram {
     /// Axial force on the bit, N.
     pub axial_force_n: f64,

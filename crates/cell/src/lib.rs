@@ -1,3 +1,5 @@
 //! The disassembly program: device traits and drivers, capture loop, planning, outcomes, journal.
 
+pub mod config;
 pub mod device;
+pub mod program;
