@@ -1,7 +1,11 @@
 //! From what an item is to what it looks like: geometry, surface and wear on one grid.
 
-use crate::fastener::Item;
+use crate::fastener::{Decoy, Item, Kind};
+use crate::form;
 use crate::relief::{Material, Relief};
+use crate::wear;
+use rand::SeedableRng;
+use rand_pcg::Pcg64Mcg;
 
 /// The sheet under an item.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -14,45 +18,293 @@ pub struct SheetFinish {
     pub metallic: f32,
 }
 
-/// Height and material of an item on the sheet it sits in; the same for the same arguments.
-pub fn bake(item: &Item, sheet: &SheetFinish) -> Relief {
-    let texel_mm = 0.1_f32;
-    let radius = 0.5 * item.diameter_mm as f32;
-    let size = ((4.8 * radius / texel_mm) as usize).clamp(48, 320);
-    let half = 0.5 * texel_mm * (size - 1) as f32;
-    let mut height_mm = vec![0.0; size * size];
-    let mut cover = vec![0.0; size * size];
-    for (i, (height, cover)) in height_mm.iter_mut().zip(&mut cover).enumerate() {
-        let x = (i % size) as f32 * texel_mm - half;
-        let y = (i / size) as f32 * texel_mm - half;
-        let rho = (x * x + y * y).sqrt() / radius;
-        if rho < 1.0 {
-            *height = 0.6 * radius * (1.0 - rho.powi(4)).sqrt();
-            *cover = 1.0;
+/// One cell of the grid while it is made.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Texel {
+    pub height: f32,
+    pub material: Material,
+    pub cover: f32,
+    pub solid: bool,
+    /// Part of the form (`u8::MAX`: sheet).
+    pub part: u8,
+    /// Depth of the clean recess, mm.
+    pub recess: f32,
+    /// How much of that depth is filled, mm.
+    pub filled: f32,
+    /// Opaque lumps over it, 0 to 1.
+    pub lump: f32,
+    /// Hidden by strands, 0 to 1.
+    pub hidden: f32,
+    /// Bright torn metal, 0 to 1.
+    pub burr: f32,
+    /// Share of the surroundings it sees.
+    pub open: f32,
+}
+
+impl Texel {
+    /// Lays a material over what is there.
+    #[inline]
+    pub fn lay(&mut self, material: &Material, alpha: f32) {
+        let alpha = alpha.clamp(0.0, 1.0);
+        let cover = alpha + self.cover * (1.0 - alpha);
+        if cover < 1e-4 {
+            return;
+        }
+        let t = alpha / cover;
+        let under = &mut self.material;
+        for (a, b) in under.albedo.iter_mut().zip(material.albedo) {
+            *a += t * (b - *a);
+        }
+        under.roughness += t * (material.roughness - under.roughness);
+        under.metallic += t * (material.metallic - under.metallic);
+        self.cover = cover;
+    }
+}
+
+/// The grid while it is made.
+pub(crate) struct Canvas {
+    pub size: usize,
+    pub texel_mm: f32,
+    /// Radius of the item, mm.
+    pub radius: f32,
+    /// Where the item's axis meets its rim plane, mm.
+    pub center: [f32; 2],
+    pub texels: Vec<Texel>,
+}
+
+impl Canvas {
+    pub fn half_mm(&self) -> f32 {
+        0.5 * self.texel_mm * (self.size - 1) as f32
+    }
+
+    /// Calls `f` with the place (mm) of every texel.
+    pub fn each(&mut self, mut f: impl FnMut(f32, f32, &mut Texel)) {
+        let half = self.half_mm();
+        for (row, line) in self.texels.chunks_exact_mut(self.size).enumerate() {
+            let y = row as f32 * self.texel_mm - half;
+            for (column, texel) in line.iter_mut().enumerate() {
+                f(column as f32 * self.texel_mm - half, y, texel);
+            }
         }
     }
-    Relief {
+
+    /// One pass of a 3 x 3 binomial filter over the heights, `amount` of it, where `keep` holds.
+    pub fn smooth(&mut self, amount: f32, keep: impl Fn(&Texel) -> bool) {
+        let size = self.size;
+        let before: Vec<f32> = self.texels.iter().map(|t| t.height).collect();
+        for row in 1..size - 1 {
+            for i in row * size + 1..(row + 1) * size - 1 {
+                if !keep(&self.texels[i]) {
+                    continue;
+                }
+                let line = |j: usize| before[j - 1] + 2.0 * before[j] + before[j + 1];
+                let mean = (line(i - size) + 2.0 * line(i) + line(i + size)) / 16.0;
+                self.texels[i].height += amount * (mean - self.texels[i].height);
+            }
+        }
+    }
+
+    /// Ambient occlusion from the horizon in eight directions, on every second texel.
+    fn occlude(&mut self) {
+        const REACH: [f32; 6] = [1.0, 2.0, 3.5, 6.0, 10.0, 17.0];
+        const COMPASS: [[f32; 2]; 8] = [
+            [1.0, 0.0],
+            [0.707, 0.707],
+            [0.0, 1.0],
+            [-0.707, 0.707],
+            [-1.0, 0.0],
+            [-0.707, -0.707],
+            [0.0, -1.0],
+            [0.707, -0.707],
+        ];
+        let coarse = self.size.div_ceil(2);
+        let step_mm = 2.0 * self.texel_mm;
+        let heights: Vec<f32> = (0..coarse * coarse)
+            .map(|i| self.texels[2 * (i / coarse) * self.size + 2 * (i % coarse)].height)
+            .collect();
+        let mut open = vec![1.0_f32; coarse * coarse];
+        for row in 0..coarse {
+            for column in 0..coarse {
+                let here = heights[row * coarse + column];
+                let mut sum = 0.0;
+                for [dx, dy] in COMPASS {
+                    let mut slope = 0.0_f32;
+                    for reach in REACH {
+                        let x = column as f32 + dx * reach + 0.5;
+                        let y = row as f32 + dy * reach + 0.5;
+                        if x < 0.0 || y < 0.0 || x >= coarse as f32 || y >= coarse as f32 {
+                            break;
+                        }
+                        let rise = heights[y as usize * coarse + x as usize] - here;
+                        slope = slope.max(rise / (reach * step_mm));
+                    }
+                    sum += 1.0 / (1.0 + slope * slope);
+                }
+                open[row * coarse + column] = sum / COMPASS.len() as f32;
+            }
+        }
+        let last = coarse - 1;
+        for (i, texel) in self.texels.iter_mut().enumerate() {
+            let (column, row) = (i % self.size, i / self.size);
+            let (x0, y0) = (column / 2, row / 2);
+            let (x1, y1) = ((column.div_ceil(2)).min(last), (row.div_ceil(2)).min(last));
+            texel.open = 0.25
+                * (open[y0 * coarse + x0] + open[y0 * coarse + x1] + open[y1 * coarse + x0] + open[y1 * coarse + x1]);
+        }
+    }
+}
+
+/// Whether an item is a body of its own that can be askew or stand off.
+fn is_body(kind: Kind) -> bool {
+    match kind {
+        Kind::Screw { .. } => true,
+        Kind::Decoy(decoy) => decoy.drive().is_some() || matches!(decoy, Decoy::Rivet | Decoy::PlasticCap),
+    }
+}
+
+/// Height and material of an item on the sheet it sits in; the same for the same arguments.
+///
+/// The grid reaches 2.4 radii from the item's place: its seat, the grime and the rust that bleeds from it are inside, and both
+/// heights and cover fade to nothing toward the border.
+pub fn bake(item: &Item, sheet: &SheetFinish) -> Relief {
+    let mut rng = Pcg64Mcg::seed_from_u64(item.seed ^ 0x5eed_cafe);
+    let radius = (0.5 * item.diameter_mm as f32).max(0.5);
+    let texel_mm = (radius / 48.0).clamp(0.06, 0.115);
+    let size = ((4.8 * radius / texel_mm) as usize).clamp(48, 320);
+    let form = form::build(item, sheet, &mut rng);
+
+    let body = is_body(item.kind);
+    let tilt = if body { item.tilt_rad as f32 } else { 0.0 };
+    let (lean_y, lean_x) = (item.tilt_direction_rad as f32).sin_cos();
+    let slope = tilt.tan();
+    // A head seated askew stands on its low edge.
+    let lift = if body {
+        item.lift_mm as f32 + 0.5 * radius * slope.abs()
+    } else {
+        0.0
+    };
+    let center = [form.rim_mm * tilt.sin() * lean_x, form.rim_mm * tilt.sin() * lean_y];
+    let (sin, cos) = (item.rotation_rad as f32).sin_cos();
+    let turned = |x: f32, y: f32| (cos * x + sin * y, -sin * x + cos * y);
+
+    let blank = Texel {
+        height: 0.0,
+        material: Material {
+            albedo: sheet.albedo,
+            roughness: sheet.roughness,
+            metallic: sheet.metallic,
+        },
+        cover: 0.0,
+        solid: false,
+        part: u8::MAX,
+        recess: 0.0,
+        filled: 0.0,
+        lump: 0.0,
+        hidden: 0.0,
+        burr: 0.0,
+        open: 1.0,
+    };
+    let mut canvas = Canvas {
         size,
         texel_mm,
-        solid: cover.iter().map(|&c| c > 0.5).collect(),
-        material: vec![
-            Material {
-                albedo: [0.7; 3],
-                roughness: 0.35,
-                metallic: 1.0 - sheet.metallic * 0.0,
-            };
-            size * size
-        ],
-        height_mm,
-        cover,
-        open: vec![1.0; size * size],
-        top_mm: 0.6 * radius,
-        bottom_mm: 0.0,
-        rim_height_mm: 0.6 * radius,
-        rim_center_mm: [0.0, 0.0, 0.6 * radius],
-        axis: [0.0, 0.0, 1.0],
-        slot_fill: 0.0,
-        head_cover: 0.0,
-        slot_visible: 1.0,
+        radius,
+        center,
+        texels: vec![blank; size * size],
+    };
+    let reach = form.reach_mm * form.reach_mm;
+    let moved = center != [0.0; 2];
+    canvas.each(|x, y, texel| {
+        if x * x + y * y > reach {
+            return;
+        }
+        let (u, v) = turned(x - center[0], y - center[1]);
+        let mut spot = (form.surface)(u, v);
+        if !spot.solid && moved {
+            let (u, v) = turned(x, y);
+            spot = (form.surface)(u, v);
+            if spot.solid {
+                // What the tilted head no longer covers.
+                spot = (form.surface)(form.reach_mm, 0.0);
+            }
+        }
+        texel.height = spot.height;
+        if spot.solid {
+            let fall = slope * ((x - center[0]) * lean_x + (y - center[1]) * lean_y);
+            texel.height = (spot.height + lift - fall).max(if spot.recess > 0.0 { -9.0 } else { 0.03 });
+        }
+        texel.solid = spot.solid;
+        texel.recess = spot.recess;
+        texel.burr = spot.burr;
+        if let Some(part) = spot.part {
+            texel.part = part;
+            texel.material = form.materials[part as usize];
+            texel.cover = 1.0;
+        }
+    });
+
+    wear::reshape(&mut canvas, item, &form, &mut rng);
+    canvas.smooth(0.7, |t| t.part != u8::MAX);
+    canvas.occlude();
+    wear::colour(&mut canvas, item, sheet, &form, &mut rng);
+    let sums = wear::Sums::of(&canvas);
+
+    let offset = match item.kind {
+        Kind::Screw { .. } => item.recess_offset_mm.map(|v| v as f32),
+        Kind::Decoy(_) => [0.0; 2],
+    };
+    let (ox, oy) = (cos * offset[0] - sin * offset[1], sin * offset[0] + cos * offset[1]);
+    let rim_center_mm = [
+        center[0] + ox,
+        center[1] + oy,
+        form.rim_mm + lift - slope * (ox * lean_x + oy * lean_y),
+    ];
+    finish(
+        canvas,
+        Seat {
+            rim_center_mm,
+            axis: [tilt.sin() * lean_x, tilt.sin() * lean_y, tilt.cos()],
+            rim_height_mm: form.rim_mm + lift,
+        },
+        sums,
+    )
+}
+
+/// Where the item ended up.
+struct Seat {
+    rim_center_mm: [f32; 3],
+    axis: [f32; 3],
+    rim_height_mm: f32,
+}
+
+/// Fades the border, lets light bounce in hollows, and splits the texels into the planes the renderer reads.
+fn finish(mut canvas: Canvas, seat: Seat, sums: wear::Sums) -> Relief {
+    let half = canvas.half_mm();
+    canvas.each(|x, y, texel| {
+        let r = (x * x + y * y).sqrt() / half;
+        let fade = 1.0 - crate::noise::smoothstep(0.84, 0.99, r);
+        texel.height *= fade;
+        texel.cover *= fade;
+        let m = &texel.material;
+        let mean = (m.albedo[0] + m.albedo[1] + m.albedo[2]) / 3.0;
+        // Light that bounces between the walls of a hollow comes out weakened by every bounce.
+        texel.open = (texel.open / (1.0 - 0.75 * mean * (1.0 - texel.open))).clamp(0.0, 1.0);
+    });
+    let heights = canvas.texels.iter().map(|t| t.height);
+    Relief {
+        size: canvas.size,
+        texel_mm: canvas.texel_mm,
+        top_mm: heights.clone().fold(0.0, f32::max),
+        bottom_mm: heights.clone().fold(0.0, f32::min),
+        height_mm: heights.collect(),
+        material: canvas.texels.iter().map(|t| t.material).collect(),
+        cover: canvas.texels.iter().map(|t| t.cover).collect(),
+        solid: canvas.texels.iter().map(|t| t.solid).collect(),
+        open: canvas.texels.iter().map(|t| t.open).collect(),
+        rim_height_mm: seat.rim_height_mm,
+        rim_center_mm: seat.rim_center_mm,
+        axis: seat.axis,
+        slot_fill: sums.slot_fill,
+        head_cover: sums.head_cover,
+        slot_visible: sums.slot_visible,
     }
 }

@@ -2,5 +2,9 @@
 
 pub mod bake;
 pub mod fastener;
+mod form;
+mod noise;
 pub mod relief;
 pub mod shade;
+mod texture;
+mod wear;
