@@ -1,7 +1,7 @@
 //! How fast this machine runs and trains networks of the size that the detector uses.
 //!
 //! ```sh
-//! cargo run --release -p nn --example throughput
+//! cargo run --release -p nn --example throughput [training]
 //! ```
 
 use std::hint::black_box;
@@ -105,16 +105,16 @@ fn main() {
     let peak = operations as f64 / seconds / 1e9;
     println!("{threads} threads, {peak:.0} GFLOP/s of multiplications and additions");
 
-    println!("inference, 1503 x 2052 pixels");
+    let training_only = std::env::args().any(|argument| argument == "training");
     let layers = |channels: usize, count: usize| vec![conv(3, 1, 1, channels); count];
     let mut cases: Vec<(String, Spec, usize, usize)> = [16, 24, 32, 48, 64]
         .into_iter()
         .map(|c| {
             let spec = Spec {
                 input_channels: c,
-                layers: layers(c, 2),
+                layers: layers(c, 4),
             };
-            (format!("2 x 3x3, {c} channels"), spec, 1503 / 2, 2052 / 2)
+            (format!("4 x 3x3, {c} channels"), spec, 1503 / 2, 2052 / 2)
         })
         .collect();
     let mut detector = vec![conv(3, 2, 1, 16), conv(3, 2, 1, 32)];
@@ -132,6 +132,11 @@ fn main() {
         layers: detector,
     };
     cases.push(("detector, 3 channels".into(), detector.clone(), 1503, 2052));
+    if training_only {
+        cases.clear();
+    } else {
+        println!("inference, 1503 x 2052 pixels");
+    }
     for (name, spec, h, w) in cases {
         let network = Trainer::new(spec.clone(), 1).network();
         let source = Grey(h, w, spec.input_channels);
@@ -151,10 +156,10 @@ fn main() {
     }
     let mut output = trainer.forward(&batch);
     output.data.fill(1e-3);
-    let forward = fastest(15, || {
+    let forward = fastest(30, || {
         black_box(trainer.forward(&batch));
     });
-    let step = fastest(15, || {
+    let step = fastest(30, || {
         black_box(trainer.forward(&batch));
         trainer.backward(&output);
         trainer.adam_step(1e-3, 0.0);

@@ -26,6 +26,8 @@
 //! assert_eq!(trainer.network().forward_batch(&batch).h, 8);
 //! ```
 
+#![cfg_attr(test, allow(clippy::unwrap_used))]
+
 mod conv;
 mod elementwise;
 mod error;
@@ -33,6 +35,7 @@ mod file;
 mod kernel;
 mod loss;
 mod network;
+pub mod onnx;
 mod spec;
 mod tensor;
 mod train;

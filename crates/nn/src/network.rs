@@ -25,7 +25,7 @@ pub struct Network {
 }
 
 #[derive(Clone, Debug)]
-enum Layer {
+pub(crate) enum Layer {
     Conv {
         geometry: Geometry,
         weights: Vec<f32>,
@@ -57,6 +57,10 @@ impl Network {
     /// The architecture.
     pub fn spec(&self) -> &Spec {
         &self.spec
+    }
+
+    pub(crate) fn layers(&self) -> &[Layer] {
+        &self.layers
     }
 
     /// Reads a network from a file that [`Trainer::save`](crate::Trainer::save) wrote.
