@@ -1,6 +1,45 @@
-//! Image to screws: coarse, fine, centre, locate; image to calibration marker.
+//! Image to screws (coarse, fine, centre, locate), and image to calibration marker. Inference only: `training` makes the models.
+//!
+//! The first two steps of the way of one unit: `RgbdFrame` → [`Detector::detect`] → [`Screw`] (pixel ± σ, and `Point<Camera>` where
+//! there is depth); a calibration map takes it from there. It is Algorithm 1 of the paper: a high-recall network over the whole
+//! picture ([`coarse_map`], [`candidates`]), the mean of three high-precision ones on gamma-corrected clips ([`look`]), the centre from
+//! outer circle, cross edges and the networks' votes ([`outer_circle`], [`cross`], [`fuse`]), and the depth of the recess rim
+//! ([`locate`]).
+//!
+//! ```
+//! use geometry::RgbdFrame;
+//! use vision::{Detector, Options, Verdict};
+//! # fn main() -> Result<(), vision::ModelError> {
+//! let detector = Detector::embedded()?;
+//! let frame = RgbdFrame {
+//!     color: image::RgbImage::from_pixel(320, 240, image::Rgb([120; 3])),
+//!     depth: None,
+//!     camera: None,
+//!     t_s: 0.0,
+//! };
+//! for screw in &detector.detect(&frame, &Options::default()).screws {
+//!     if screw.verdict == Verdict::Screw {
+//!         println!("{:.1} {:.1} ± {:.2} px", screw.pixel.u_px, screw.pixel.v_px, screw.sigma_px);
+//!     }
+//! }
+//! # Ok(())
+//! # }
+//! ```
 
+mod center;
+mod coarse;
+mod detect;
+mod fine;
 pub mod layout;
+mod locate;
 mod model;
+mod picture;
+#[cfg(test)]
+mod synthetic;
 
+pub use center::{Circle, Cross, Cue, CueCenter, Fused, cross, fuse, outer_circle};
+pub use coarse::{Candidate, ProbabilityMap, candidates, coarse_map};
+pub use detect::{Detections, Detector, Drive, Options, Region, Screw, Timing, Verdict};
+pub use fine::{Clip, Evidence, look};
+pub use locate::{DepthSource, Located, locate};
 pub use model::{Corrections, Model, ModelError, Settings, Thresholds, decode_model, encode_model, model_id};
