@@ -3,3 +3,5 @@
 pub mod config;
 pub mod device;
 pub mod program;
+pub mod record;
+pub mod statistics;

@@ -1,0 +1,746 @@
+//! What is known of a unit: the events of its way, and the record that they add up to.
+//!
+//! The record is a fold over the events ([`UnitRecord::apply`]) and nothing else, so that what the journal holds after a crash
+//! is what the program knows.
+
+use crate::device::{DriveEnd, DriveProgram};
+use crate::program::FaceId;
+use geometry::{Base, Camera, Point};
+use serde::{Deserialize, Serialize};
+use std::fmt;
+
+/// What the detector says of a candidate, as in `detect --json`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Verdict {
+    /// A fastener that the mounted bit fits: may be acted on.
+    Screw,
+    /// A fastener with another drive: reported, not acted on.
+    Other,
+    /// A person should look: never acted on unattended.
+    Review,
+}
+
+/// Where a point lies with respect to the calibrated volume.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Hull {
+    /// Within it.
+    Inside,
+    /// At its border.
+    Edge,
+    /// Beyond it.
+    Outside,
+}
+
+/// A candidate on a face.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Found {
+    /// Centre of the recess in the picture, px.
+    pub u_px: f64,
+    /// Centre of the recess in the picture, px.
+    pub v_px: f64,
+    /// Its standard error, px.
+    pub sigma_px: f64,
+    /// Diameter of the head, px.
+    pub diameter_px: f64,
+    /// How sure the detector is, 0 to 1.
+    pub score: f64,
+    /// Kind of drive: `cross`, `slotted`, `hex_socket`, `torx`, `hex_head`, `unknown`.
+    pub drive: String,
+    /// What may be done with it.
+    pub verdict: Verdict,
+    /// Where it is in the camera's frame, if depth was measured there.
+    pub camera_mm: Option<Point<Camera>>,
+    /// Where it is in the base of the arm that reaches it.
+    pub base_mm: Option<Point<Base>>,
+    /// Standard error across the view, mm.
+    pub sigma_lateral_mm: Option<f64>,
+    /// Standard error along the view, mm.
+    pub sigma_depth_mm: Option<f64>,
+    /// Where it lies with respect to the calibrated volume.
+    pub hull: Option<Hull>,
+    /// Tilt of the sheet around it against the camera's axis, rad.
+    pub tilt_rad: Option<f64>,
+    /// Why it is not acted on; `None` for a target.
+    pub left_alone: Option<LeftAlone>,
+}
+
+/// Why a candidate is not acted on.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum LeftAlone {
+    /// The bit does not fit.
+    OtherDrive,
+    /// A person should look.
+    Review,
+    /// There was no depth at it.
+    NoDepth,
+    /// It lies at the border of every arm's calibrated volume.
+    HullEdge,
+    /// It lies outside every arm's calibrated volume.
+    HullOutside,
+    /// Its head is no screw's size.
+    HeadSize,
+    /// The sheet around it is bent beyond the driver's range.
+    Bent,
+}
+
+impl fmt::Display for LeftAlone {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::OtherDrive => "the bit does not fit",
+            Self::Review => "a person should look",
+            Self::NoDepth => "no depth was measured",
+            Self::HullEdge => "at the border of the calibrated volume",
+            Self::HullOutside => "outside the calibrated volume",
+            Self::HeadSize => "not the size of a screw's head",
+            Self::Bent => "the sheet is bent beyond the driver's range",
+        })
+    }
+}
+
+/// Hash of a stored picture, hexadecimal SHA-256.
+#[derive(Clone, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(transparent)]
+pub struct PictureId(pub String);
+
+/// Plane of a face.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct FacePlane {
+    /// Depth where it crosses the camera's axis, mm.
+    pub depth_mm: f64,
+    /// Tilt against the camera's axis, rad.
+    pub tilt_rad: f64,
+}
+
+/// One burst of the driver.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Burst {
+    /// What was asked of the driver; `None` if it did not come to that.
+    pub program: Option<DriveProgram>,
+    /// How it ended; `None` if a device failed before.
+    pub end: Option<DriveEnd>,
+    /// What a device said, if one failed.
+    pub error: Option<String>,
+    /// Where the bit was sent.
+    pub aim: Point<Base>,
+    /// Picture of the second look that this burst was aimed with.
+    pub second_look: Option<PictureId>,
+    /// Time from the start of the approach to the end of the retreat, s.
+    pub time_s: f64,
+}
+
+/// Everything that was done to one screw.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ScrewAttempt {
+    /// Its number in [`FaceRecord::found`].
+    pub found: usize,
+    /// Arm that did it.
+    pub arm: String,
+    /// Its bursts, the last one decided.
+    pub bursts: Vec<Burst>,
+    /// What a second picture said: `Some(true)` if a screw still stands there.
+    pub still_there: Option<bool>,
+}
+
+impl ScrewAttempt {
+    /// How the last burst ended.
+    pub fn end(&self) -> Option<DriveEnd> {
+        self.bursts.last().and_then(|b| b.end)
+    }
+    /// Bursts after the first.
+    pub fn retries(&self) -> usize {
+        self.bursts.len().saturating_sub(1)
+    }
+    /// Out, as far as driver and camera say.
+    pub fn removed(&self) -> bool {
+        self.end() == Some(DriveEnd::Removed) && self.still_there != Some(true)
+    }
+    /// Time spent on it, s.
+    pub fn time_s(&self) -> f64 {
+        self.bursts.iter().map(|b| b.time_s).sum()
+    }
+}
+
+/// Why a face was looked at.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Purpose {
+    /// Before anything on the unit was touched.
+    Survey,
+    /// To take its screws out.
+    Work,
+    /// To find what was missed, after a cover did not come off.
+    Missed,
+}
+
+/// One look at a face and what followed.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct FaceRecord {
+    /// Number of the step in the program.
+    pub step: usize,
+    /// Name of the step.
+    pub step_name: String,
+    /// The face.
+    pub face: FaceId,
+    /// Why it was looked at.
+    pub purpose: Purpose,
+    /// When the picture was taken, cell clock, s.
+    pub t_s: f64,
+    /// The picture, if pictures are kept.
+    pub picture: Option<PictureId>,
+    /// Width of the picture, px.
+    pub width_px: u32,
+    /// Height of the picture, px.
+    pub height_px: u32,
+    /// Plane of the face, if it could be measured.
+    pub plane: Option<FacePlane>,
+    /// Every candidate, in the detector's order.
+    pub found: Vec<Found>,
+    /// What was done, in the order in which it was done.
+    pub attempts: Vec<ScrewAttempt>,
+}
+
+impl FaceRecord {
+    /// Screws of this look that are out.
+    pub fn removed(&self) -> usize {
+        self.attempts.iter().filter(|a| a.removed()).count()
+    }
+}
+
+/// How a pull ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum PullEnd {
+    /// The cover came off.
+    Off,
+    /// It stayed where it was.
+    Stuck,
+}
+
+/// One pull at a cover.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct CoverRecord {
+    /// Number of the step in the program.
+    pub step: usize,
+    /// The cover.
+    pub cover: String,
+    /// How it ended.
+    pub end: PullEnd,
+    /// How that is known.
+    pub seen_by: SeenBy,
+    /// Covers that came off with it.
+    pub takes_along: Vec<String>,
+    /// Time it took, s.
+    pub time_s: f64,
+}
+
+/// What told how an action ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum SeenBy {
+    /// The device itself, or an input of the cell.
+    Signal,
+    /// A picture, because no signal could be trusted (after a crash or a time-out).
+    Picture,
+}
+
+/// Why a unit was not finished though it was begun.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum NgReason {
+    /// A cover did not come off, and no screw that holds it was seen.
+    CoverStuck,
+    /// A screw did not turn.
+    ScrewSeized,
+    /// The bit kept slipping out.
+    ScrewCamOut,
+    /// The bit did not find the recess.
+    ScrewMissed,
+    /// A screw stands where no arm may go.
+    ScrewOutOfReach,
+    /// A device failed or did not answer.
+    DeviceFault,
+}
+
+/// Why a unit was not begun.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ExclusionReason {
+    /// A head whose recess cannot be judged: mud, web, paint.
+    SlotNotWorkable,
+    /// The face or the sheet around a screw leans beyond the range.
+    CoverBent,
+    /// Fewer screws than the product has.
+    ScrewsNotFound,
+}
+
+/// What became of a unit.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "outcome", rename_all = "snake_case")]
+pub enum Outcome {
+    /// Every cover is off.
+    Ok,
+    /// Discharged unfinished.
+    Ng {
+        /// Why, for counting.
+        reason: NgReason,
+        /// In words.
+        detail: String,
+    },
+    /// Out of scope, decided before acting.
+    Excluded {
+        /// Why, for counting.
+        reason: ExclusionReason,
+        /// In words, with the face.
+        detail: String,
+        /// Screws that had been taken out of *other* faces before this face was looked at (0 with a survey).
+        screws_out_before: usize,
+    },
+}
+
+impl Outcome {
+    /// `ok`, `ng` or `excluded`.
+    pub fn word(&self) -> &'static str {
+        match self {
+            Self::Ok => "ok",
+            Self::Ng { .. } => "ng",
+            Self::Excluded { .. } => "excluded",
+        }
+    }
+}
+
+impl fmt::Display for Outcome {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Ok => f.write_str("OK"),
+            Self::Ng { detail, .. } => write!(f, "NG: {detail}"),
+            Self::Excluded { detail, .. } => write!(f, "excluded: {detail}"),
+        }
+    }
+}
+
+/// What the time of a unit is spent on.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Resource {
+    /// Table: loading, turning, discharging.
+    Handling,
+    /// Taking screws out.
+    Screws,
+    /// Pulling covers and laying them aside.
+    Covers,
+    /// Camera and vision.
+    Inspection,
+    /// Nothing to do: no unit, or a person.
+    Waiting,
+    /// Second attempts of any kind.
+    Recovery,
+}
+
+/// Seconds by resource, cell clock.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Times {
+    /// Table: loading, turning, discharging, s.
+    pub handling_s: f64,
+    /// Taking screws out, s.
+    pub screws_s: f64,
+    /// Pulling covers, s.
+    pub covers_s: f64,
+    /// Camera and vision, s.
+    pub inspection_s: f64,
+    /// No unit, or a person, s.
+    pub waiting_s: f64,
+    /// Second attempts of any kind, s.
+    pub recovery_s: f64,
+}
+
+impl Times {
+    /// Adds a time to a resource.
+    pub fn add(&mut self, resource: Resource, time_s: f64) {
+        *match resource {
+            Resource::Handling => &mut self.handling_s,
+            Resource::Screws => &mut self.screws_s,
+            Resource::Covers => &mut self.covers_s,
+            Resource::Inspection => &mut self.inspection_s,
+            Resource::Waiting => &mut self.waiting_s,
+            Resource::Recovery => &mut self.recovery_s,
+        } += time_s;
+    }
+
+    /// From the loading switch to the end of the discharge, as the paper counts it: all but waiting, s.
+    pub fn cycle_s(&self) -> f64 {
+        self.handling_s + self.screws_s + self.covers_s + self.inspection_s + self.recovery_s
+    }
+}
+
+/// Something that changes the world and is written down before it is begun.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "act", rename_all = "snake_case")]
+pub enum Act {
+    /// Turn a face to the camera.
+    Present {
+        /// The face.
+        face: FaceId,
+    },
+    /// Drive one burst at a screw of the face that was looked at last.
+    Drive {
+        /// Number in [`FaceRecord::found`].
+        found: usize,
+        /// Arm.
+        arm: String,
+        /// Where the bit is sent.
+        aim: Point<Base>,
+        /// 0 for the first burst.
+        burst: usize,
+    },
+    /// Pull a cover.
+    Pull {
+        /// The cover.
+        cover: String,
+    },
+    /// Hand the unit out.
+    Discharge,
+}
+
+/// An event of a unit's way. The journal holds them in order; [`UnitRecord::apply`] is all that is ever made of them.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "event", rename_all = "snake_case")]
+pub enum Event {
+    /// The unit stands on the table.
+    Arrived {
+        /// Its model number, if it could be read.
+        model: Option<String>,
+    },
+    /// The program was started again in the middle of the unit.
+    Resumed,
+    /// About to act.
+    Intent {
+        /// What.
+        act: Act,
+    },
+    /// A face stands before the camera.
+    Presented {
+        /// The face.
+        face: FaceId,
+    },
+    /// A face was looked at.
+    Seen {
+        /// What was found.
+        face: Box<FaceRecord>,
+    },
+    /// A burst ended.
+    Driven {
+        /// Number in [`FaceRecord::found`].
+        found: usize,
+        /// Arm.
+        arm: String,
+        /// How.
+        burst: Burst,
+    },
+    /// The screws that were attempted have been looked at again.
+    Verified {
+        /// Numbers in [`FaceRecord::found`] with what the picture said: true if a screw still stands there.
+        screws: Vec<(usize, bool)>,
+        /// The pictures.
+        pictures: Vec<PictureId>,
+    },
+    /// A pull ended.
+    Pulled {
+        /// How.
+        cover: CoverRecord,
+    },
+    /// From here on (or no longer) time is spent on making something good.
+    Recovery {
+        /// Beginning or end.
+        on: bool,
+    },
+    /// A step is finished.
+    StepDone {
+        /// Its number.
+        step: usize,
+    },
+    /// The outcome is known.
+    Decided {
+        /// It.
+        outcome: Outcome,
+    },
+    /// The unit has left the table.
+    Discharged,
+}
+
+impl Event {
+    /// Its name in the journal's `kind` column.
+    pub fn kind(&self) -> &'static str {
+        match self {
+            Self::Arrived { .. } => "arrived",
+            Self::Resumed => "resumed",
+            Self::Intent { .. } => "intent",
+            Self::Presented { .. } => "presented",
+            Self::Seen { .. } => "seen",
+            Self::Driven { .. } => "driven",
+            Self::Verified { .. } => "verified",
+            Self::Pulled { .. } => "pulled",
+            Self::Recovery { .. } => "recovery",
+            Self::StepDone { .. } => "step_done",
+            Self::Decided { .. } => "decided",
+            Self::Discharged => "discharged",
+        }
+    }
+
+    /// What the time since the event before was spent on.
+    fn resource(&self) -> Resource {
+        match self {
+            Self::Arrived { .. } | Self::Resumed => Resource::Waiting,
+            Self::Presented { .. } | Self::Discharged => Resource::Handling,
+            Self::Driven { .. } => Resource::Screws,
+            Self::Pulled { .. } => Resource::Covers,
+            Self::Intent {
+                act: Act::Present { .. } | Act::Discharge,
+            } => Resource::Handling,
+            Self::Intent { act: Act::Drive { .. } } => Resource::Screws,
+            Self::Intent { act: Act::Pull { .. } } => Resource::Covers,
+            Self::Seen { .. } | Self::Verified { .. } => Resource::Inspection,
+            Self::Recovery { .. } | Self::StepDone { .. } | Self::Decided { .. } => Resource::Inspection,
+        }
+    }
+}
+
+/// Everything about one unit.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct UnitRecord {
+    /// Number of the unit in this run, from 1.
+    pub unit: u64,
+    /// Model number, if it could be read.
+    pub model: Option<String>,
+    /// When it was begun, cell clock, s.
+    pub started_s: f64,
+    /// Time of the last event, cell clock, s.
+    pub last_s: f64,
+    /// What became of it; `None` while it is under way.
+    #[serde(flatten)]
+    pub outcome: Option<Outcome>,
+    /// Steps that are finished.
+    pub steps_done: usize,
+    /// Every look at a face, in order.
+    pub faces: Vec<FaceRecord>,
+    /// Every pull, in order.
+    pub covers: Vec<CoverRecord>,
+    /// Seconds by resource.
+    pub times: Times,
+    /// How often the program was started again in the middle of it.
+    pub resumed: u32,
+    /// The act that was begun and whose end is not known: look before anything else.
+    pub open: Option<Act>,
+    /// True once it has left the table.
+    pub discharged: bool,
+    /// True while time counts as recovery.
+    #[serde(default)]
+    pub recovering: bool,
+    /// Pictures taken to verify, in order.
+    #[serde(default)]
+    pub looks: Vec<PictureId>,
+}
+
+impl UnitRecord {
+    /// A unit of which nothing is known yet; its time starts at `t_s`.
+    pub fn new(unit: u64, t_s: f64) -> Self {
+        Self {
+            unit,
+            model: None,
+            started_s: t_s,
+            last_s: t_s,
+            outcome: None,
+            steps_done: 0,
+            faces: Vec::new(),
+            covers: Vec::new(),
+            times: Times::default(),
+            resumed: 0,
+            open: None,
+            discharged: false,
+            recovering: false,
+            looks: Vec::new(),
+        }
+    }
+
+    /// The record that events add up to; `started_s` is when the unit was asked for.
+    pub fn from_events<'a>(unit: u64, started_s: f64, events: impl IntoIterator<Item = &'a (f64, Event)>) -> Self {
+        let mut record = Self::new(unit, started_s);
+        for (t_s, event) in events {
+            record.apply(*t_s, event);
+        }
+        record
+    }
+
+    /// Takes one event in: pure bookkeeping, no device is asked.
+    pub fn apply(&mut self, t_s: f64, event: &Event) {
+        // A clock that started again with the machine must not give negative times.
+        let spent_s = (t_s - self.last_s).max(0.0);
+        let resource = match event.resource() {
+            Resource::Waiting => Resource::Waiting,
+            _ if self.recovering => Resource::Recovery,
+            resource => resource,
+        };
+        self.times.add(resource, spent_s);
+        self.last_s = t_s;
+        match event {
+            Event::Arrived { model } => self.model.clone_from(model),
+            Event::Resumed => {
+                self.resumed += 1;
+                self.recovering = false;
+            }
+            Event::Intent { act } => self.open = Some(act.clone()),
+            Event::Presented { .. } => self.open = None,
+            // A look at the world answers whatever was in doubt about it; what it showed is in the record that comes with it.
+            Event::Seen { face } => {
+                self.faces.push((**face).clone());
+                self.open = None;
+            }
+            Event::Driven { found, arm, burst } => {
+                self.open = None;
+                if let Some(face) = self.faces.last_mut() {
+                    match face.attempts.iter_mut().find(|a| a.found == *found) {
+                        Some(attempt) => {
+                            attempt.bursts.push(burst.clone());
+                            attempt.still_there = None;
+                        }
+                        None => face.attempts.push(ScrewAttempt {
+                            found: *found,
+                            arm: arm.clone(),
+                            bursts: vec![burst.clone()],
+                            still_there: None,
+                        }),
+                    }
+                }
+            }
+            Event::Verified { screws, pictures } => {
+                self.looks.extend(pictures.iter().cloned());
+                if let Some(face) = self.faces.last_mut() {
+                    for (found, stands) in screws {
+                        for attempt in face.attempts.iter_mut().filter(|a| a.found == *found) {
+                            attempt.still_there = Some(*stands);
+                        }
+                    }
+                }
+            }
+            Event::Pulled { cover } => {
+                self.open = None;
+                self.covers.push(cover.clone());
+            }
+            Event::Recovery { on } => self.recovering = *on,
+            Event::StepDone { step } => self.steps_done = step + 1,
+            Event::Decided { outcome } => self.outcome = Some(outcome.clone()),
+            Event::Discharged => {
+                self.open = None;
+                self.discharged = true;
+            }
+        }
+    }
+
+    /// Screws taken out so far, as far as driver and camera say.
+    pub fn screws_out(&self) -> usize {
+        self.faces.iter().map(FaceRecord::removed).sum()
+    }
+
+    /// Attempts of the whole unit.
+    pub fn attempts(&self) -> impl Iterator<Item = &ScrewAttempt> {
+        self.faces.iter().flat_map(|f| &f.attempts)
+    }
+
+    /// Covers that are off, with those that they took along.
+    pub fn covers_off(&self) -> Vec<&str> {
+        let off = self.covers.iter().filter(|c| c.end == PullEnd::Off);
+        off.flat_map(|c| std::iter::once(c.cover.as_str()).chain(c.takes_along.iter().map(String::as_str)))
+            .collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn burst(end: DriveEnd) -> Burst {
+        Burst {
+            program: None,
+            end: Some(end),
+            error: None,
+            aim: Point::new(1.0, 2.0, 3.0),
+            second_look: None,
+            time_s: 3.0,
+        }
+    }
+
+    fn face() -> Box<FaceRecord> {
+        Box::new(FaceRecord {
+            step: 0,
+            step_name: "front screws".into(),
+            face: "front".into(),
+            purpose: Purpose::Work,
+            t_s: 12.0,
+            picture: None,
+            width_px: 40,
+            height_px: 30,
+            plane: None,
+            found: Vec::new(),
+            attempts: Vec::new(),
+        })
+    }
+
+    #[test]
+    fn times_add_up_to_the_clock_and_go_where_they_belong() {
+        let events = [
+            (10.0, Event::Arrived { model: None }),
+            (10.0, Event::Intent { act: Act::Present { face: "front".into() } }),
+            (15.0, Event::Presented { face: "front".into() }),
+            (17.0, Event::Seen { face: face() }),
+            (21.0, Event::Driven { found: 0, arm: "arm_a".into(), burst: burst(DriveEnd::CamOut) }),
+            (21.0, Event::Recovery { on: true }),
+            (24.0, Event::Driven { found: 0, arm: "arm_a".into(), burst: burst(DriveEnd::Removed) }),
+            (24.0, Event::Recovery { on: false }),
+            (25.0, Event::Verified { screws: vec![(0, false)], pictures: vec![] }),
+            (28.0, Event::Discharged),
+        ];
+        let record = UnitRecord::from_events(1, 4.0, &events);
+        let t = record.times;
+        assert_eq!(
+            [t.waiting_s, t.handling_s, t.inspection_s, t.screws_s, t.recovery_s, t.covers_s],
+            [6.0, 8.0, 3.0, 4.0, 3.0, 0.0]
+        );
+        assert!((t.cycle_s() + t.waiting_s - 24.0).abs() < 1e-12);
+        assert_eq!(record.screws_out(), 1);
+        assert_eq!(record.faces[0].attempts[0].retries(), 1);
+        let text = serde_json::to_string(&record).expect("as JSON");
+        assert_eq!(serde_json::from_str::<UnitRecord>(&text).expect("back"), record);
+    }
+
+    #[test]
+    fn a_picture_outweighs_the_driver() {
+        let mut record = UnitRecord::new(1, 0.0);
+        record.apply(0.0, &Event::Seen { face: face() });
+        record.apply(1.0, &Event::Driven { found: 0, arm: "a".into(), burst: burst(DriveEnd::Removed) });
+        assert_eq!(record.screws_out(), 1);
+        record.apply(2.0, &Event::Verified { screws: vec![(0, true)], pictures: vec![] });
+        assert_eq!(record.screws_out(), 0);
+    }
+
+    #[test]
+    fn an_act_stays_open_until_it_is_answered() {
+        let mut record = UnitRecord::new(1, 0.0);
+        let act = Act::Pull { cover: "top".into() };
+        record.apply(0.0, &Event::Intent { act: act.clone() });
+        record.apply(5.0, &Event::Resumed);
+        assert_eq!(record.open, Some(act));
+        let cover = CoverRecord {
+            step: 3,
+            cover: "front".into(),
+            end: PullEnd::Off,
+            seen_by: SeenBy::Picture,
+            takes_along: vec!["left".into()],
+            time_s: 0.0,
+        };
+        record.apply(6.0, &Event::Pulled { cover });
+        assert_eq!(record.open, None);
+        assert_eq!(record.covers_off(), ["front", "left"]);
+    }
+}

@@ -1,0 +1,206 @@
+//! Rates with their bounds, and times by resource: what a number of units says.
+
+use crate::record::{Outcome, Times, UnitRecord};
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+
+/// A share with its 95 % bounds.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Rate {
+    /// How many were.
+    pub hits: usize,
+    /// Of how many.
+    pub of: usize,
+    /// hits / of; `None` of nothing.
+    pub rate: Option<f64>,
+    /// Lower 95 % bound.
+    pub low: f64,
+    /// Upper 95 % bound.
+    pub high: f64,
+}
+
+impl Rate {
+    /// A share with its Wilson score bounds.
+    pub fn of(hits: usize, of: usize) -> Self {
+        let (low, high) = wilson(hits, of);
+        Self {
+            hits,
+            of,
+            rate: (of > 0).then(|| hits as f64 / of as f64),
+            low,
+            high,
+        }
+    }
+}
+
+/// 95 % bounds of a binomial share (Wilson 1927); (0, 1) of nothing.
+pub fn wilson(hits: usize, of: usize) -> (f64, f64) {
+    if of == 0 {
+        return (0.0, 1.0);
+    }
+    const Z: f64 = 1.959_963_984_540_054;
+    let (n, p) = (of as f64, hits as f64 / of as f64);
+    let centre = p + Z * Z / (2.0 * n);
+    let half = Z * (p * (1.0 - p) / n + Z * Z / (4.0 * n * n)).sqrt();
+    let scale = 1.0 + Z * Z / n;
+    (((centre - half) / scale).max(0.0), ((centre + half) / scale).min(1.0))
+}
+
+/// What a number of units says.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Statistics {
+    /// Finished units.
+    pub units: usize,
+    /// Taken apart.
+    pub ok: usize,
+    /// Begun, not finished.
+    pub ng: usize,
+    /// Out of scope.
+    pub excluded: usize,
+    /// Of the excluded, those of which a screw of another face had been taken out before.
+    pub excluded_after_acting: usize,
+    /// OK of those in scope (paper: 78.3 %).
+    pub ok_in_scope: Rate,
+    /// OK of all (paper: 60.0 %).
+    pub ok_of_all: Rate,
+    /// Mean cycle over OK and NG units, as the paper counts it, s (paper: 193, its parts 195.7).
+    pub cycle_mean_s: Option<f64>,
+    /// Mean cycle of OK units, s (paper: 197).
+    pub cycle_ok_mean_s: Option<f64>,
+    /// Mean cycle of NG units, s (paper: 191).
+    pub cycle_ng_mean_s: Option<f64>,
+    /// Mean times by resource over OK and NG units, s.
+    pub times_mean: Times,
+    /// Screws that were acted on.
+    pub screws_attempted: usize,
+    /// Of these out, as far as driver and camera say.
+    pub screws_removed: Rate,
+    /// Of these, with more than one burst.
+    pub screws_retried: usize,
+    /// Units by reason: `ng: screw_seized`, `excluded: cover_bent`.
+    pub causes: BTreeMap<String, usize>,
+}
+
+impl Statistics {
+    /// Over finished units; those under way are left out.
+    pub fn over(records: &[UnitRecord]) -> Self {
+        let mut causes = BTreeMap::new();
+        let (mut ok, mut ng, mut excluded, mut after) = (Vec::new(), Vec::new(), 0, 0);
+        let mut attempts = Vec::new();
+        for record in records {
+            let Some(outcome) = &record.outcome else { continue };
+            attempts.extend(record.attempts());
+            let cause = match outcome {
+                Outcome::Ok => {
+                    ok.push(record);
+                    continue;
+                }
+                Outcome::Ng { reason, .. } => {
+                    ng.push(record);
+                    format!("ng: {}", word(reason))
+                }
+                Outcome::Excluded {
+                    reason,
+                    screws_out_before,
+                    ..
+                } => {
+                    excluded += 1;
+                    after += usize::from(*screws_out_before > 0);
+                    format!("excluded: {}", word(reason))
+                }
+            };
+            *causes.entry(cause).or_default() += 1;
+        }
+        let in_scope: Vec<&UnitRecord> = ok.iter().chain(&ng).copied().collect();
+        let units = in_scope.len() + excluded;
+        let mut times_mean = Times::default();
+        for record in &in_scope {
+            let share = 1.0 / in_scope.len() as f64;
+            times_mean.handling_s += share * record.times.handling_s;
+            times_mean.screws_s += share * record.times.screws_s;
+            times_mean.covers_s += share * record.times.covers_s;
+            times_mean.inspection_s += share * record.times.inspection_s;
+            times_mean.waiting_s += share * record.times.waiting_s;
+            times_mean.recovery_s += share * record.times.recovery_s;
+        }
+        Self {
+            units,
+            ok: ok.len(),
+            ng: ng.len(),
+            excluded,
+            excluded_after_acting: after,
+            ok_in_scope: Rate::of(ok.len(), in_scope.len()),
+            ok_of_all: Rate::of(ok.len(), units),
+            cycle_mean_s: mean_cycle_s(&in_scope),
+            cycle_ok_mean_s: mean_cycle_s(&ok),
+            cycle_ng_mean_s: mean_cycle_s(&ng),
+            times_mean,
+            screws_attempted: attempts.len(),
+            screws_removed: Rate::of(attempts.iter().filter(|a| a.removed()).count(), attempts.len()),
+            screws_retried: attempts.iter().filter(|a| a.retries() > 0).count(),
+            causes,
+        }
+    }
+}
+
+fn mean_cycle_s(records: &[&UnitRecord]) -> Option<f64> {
+    (!records.is_empty()).then(|| records.iter().map(|r| r.times.cycle_s()).sum::<f64>() / records.len() as f64)
+}
+
+/// The snake-case name of a reason, as in the files.
+fn word(reason: &impl Serialize) -> String {
+    match serde_json::to_value(reason) {
+        Ok(serde_json::Value::String(word)) => word,
+        _ => "unknown".into(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::record::{ExclusionReason, NgReason};
+
+    #[test]
+    fn wilson_bounds_of_the_paper_s_figures() {
+        let percent = |(low, high): (f64, f64)| [(low * 1e4).round() / 100.0, (high * 1e4).round() / 100.0];
+        assert_eq!(percent(wilson(3064, 3070)), [99.57, 99.91]);
+        assert_eq!(percent(wilson(72, 92)), [68.79, 85.46]);
+        assert_eq!(wilson(0, 0), (0.0, 1.0));
+        let (low, high) = wilson(12, 12);
+        assert!(low > 0.7 && high == 1.0);
+    }
+
+    #[test]
+    fn excluded_units_count_in_one_rate_and_not_in_the_other() {
+        let unit = |n: u64, outcome, cycle_s| {
+            let mut record = UnitRecord::new(n, 0.0);
+            record.outcome = outcome;
+            record.times.screws_s = cycle_s;
+            record
+        };
+        let ng = Outcome::Ng {
+            reason: NgReason::ScrewSeized,
+            detail: String::new(),
+        };
+        let excluded = Outcome::Excluded {
+            reason: ExclusionReason::CoverBent,
+            detail: String::new(),
+            screws_out_before: 3,
+        };
+        let records = [
+            unit(1, Some(Outcome::Ok), 200.0),
+            unit(2, Some(Outcome::Ok), 180.0),
+            unit(3, Some(ng), 100.0),
+            unit(4, Some(excluded), 20.0),
+            unit(5, None, 0.0),
+        ];
+        let s = Statistics::over(&records);
+        assert_eq!((s.units, s.ok, s.ng, s.excluded, s.excluded_after_acting), (4, 2, 1, 1, 1));
+        assert_eq!(s.ok_in_scope.rate, Some(2.0 / 3.0));
+        assert_eq!(s.ok_of_all.rate, Some(0.5));
+        assert_eq!((s.cycle_mean_s, s.cycle_ok_mean_s), (Some(160.0), Some(190.0)));
+        assert!((s.times_mean.screws_s - 160.0).abs() < 1e-9);
+        assert_eq!(s.causes["ng: screw_seized"], 1);
+        assert_eq!(s.causes["excluded: cover_bent"], 1);
+    }
+}
