@@ -1,0 +1,722 @@
+//! Pictures of faces: rays through the lens onto sheets and items, light, then the sensor.
+//!
+//! The picture is made of blocks of 16 x 16 pixels, each on its own: a region of interest costs only the blocks it
+//! touches and has the same pixels as the whole picture, whatever the number of threads.
+
+use crate::bake::{SheetFinish, bake};
+use crate::fastener::{Decoy, Item, Kind};
+use crate::layer::{Bump, Cutout, Layer, Ray, Tube, segment_foot};
+use crate::product::Placed;
+use crate::relief::{Material, Relief};
+use crate::shade::Lighting;
+use crate::shape::{Bounds, Xy};
+use crate::view::{FaceView, Roi};
+use geometry::{DepthMap, Pixel, RgbImage};
+use rand::SeedableRng;
+use rand_pcg::Pcg64Mcg;
+use std::sync::OnceLock;
+
+/// Side of a block, px.
+pub(crate) const BLOCK: usize = 16;
+
+/// A picture with its registered depth.
+#[derive(Clone, Debug)]
+pub struct Rendered {
+    /// Colour of the region.
+    pub color: RgbImage,
+    /// Depth of half the resolution; its pixel (0, 0) is at `origin` / 2.
+    pub depth: DepthMap,
+    /// Pixel of the whole picture at the region's corner.
+    pub origin: [u32; 2],
+}
+
+/// Renders a face, or only a region of its picture. For several regions of one view, [`Prepared`] saves work.
+pub fn render(view: &FaceView, roi: Option<Roi>) -> Rendered {
+    Prepared::new(view).render(roi)
+}
+
+/// A view made ready to be rendered: background, lights, and the items' reliefs, each made once when first seen.
+pub struct Prepared {
+    view: FaceView,
+    pub(crate) layers: Vec<Layer>,
+    pub(crate) tubes: Vec<Tube>,
+    pub(crate) spots: Vec<Spot>,
+    lighting: Lighting,
+}
+
+/// An item at its place.
+pub(crate) struct Spot {
+    pub placed: Placed,
+    /// The layer it sits in.
+    layer: usize,
+    bounds: Bounds,
+    relief: OnceLock<Relief>,
+}
+
+/// Linear colour and depth of a block.
+pub(crate) struct Block {
+    pub color: [[f32; 3]; BLOCK * BLOCK],
+    pub depth_mm: [f32; BLOCK * BLOCK],
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Part {
+    Top,
+    Wall,
+    Cut(usize),
+    Tube,
+    Nothing,
+}
+
+/// What a ray meets first.
+#[derive(Clone, Copy, Debug)]
+struct Hit {
+    height: f32,
+    at: Xy,
+    layer: usize,
+    part: Part,
+}
+
+impl Hit {
+    fn same_surface(&self, other: &Hit) -> bool {
+        self.layer == other.layer && self.part == other.part
+    }
+}
+
+/// A layer as far as it matters in a block.
+struct Near<'a> {
+    index: usize,
+    layer: &'a Layer,
+    cutouts: Vec<&'a Cutout>,
+    bumps: Vec<&'a Bump>,
+}
+
+impl Near<'_> {
+    #[inline]
+    fn rise(&self, p: Xy) -> f32 {
+        let mut h = 0.0;
+        for bump in &self.bumps {
+            h += bump.height(p);
+        }
+        let edge = self.layer.edge_mm;
+        if edge > 0.0 {
+            let d = self.layer.shape.distance(p) + edge;
+            if d > 0.0 {
+                let d = d.min(edge);
+                h -= edge - (edge * edge - d * d).max(0.0).sqrt();
+            }
+        }
+        h
+    }
+
+    /// Positive outside the sheet or in an opening.
+    #[inline]
+    fn solid_distance(&self, p: Xy) -> f32 {
+        let mut d = self.layer.shape.distance(p);
+        for cutout in &self.cutouts {
+            d = d.max(-cutout.shape.distance(p));
+        }
+        d
+    }
+}
+
+/// What matters in a block.
+struct Nearby<'a> {
+    layers: Vec<Near<'a>>,
+    /// (tube, segment)
+    segments: Vec<(usize, usize)>,
+    spots: Vec<(&'a Spot, &'a Relief)>,
+}
+
+fn lerp(a: f32, b: f32, t: f32) -> f32 {
+    a + t * (b - a)
+}
+
+/// Rays of a block, interpolated between its corners: the lens is smooth over 16 pixels (error below 0.002 px).
+struct Rays {
+    corners: [[f32; 6]; 4],
+}
+
+impl Rays {
+    fn new(view: &FaceView, x_px: i64, y_px: i64) -> Self {
+        let face_from_camera = view.camera_from_face.inverse();
+        let origin = face_from_camera.isometry().translation.vector;
+        let rotation = face_from_camera.isometry().rotation;
+        let side = BLOCK as i64;
+        let corners = [(0, 0), (side, 0), (0, side), (side, side)].map(|(dx, dy)| {
+            let [x, y] = view.camera.ray(Pixel::new((x_px + dx) as f64, (y_px + dy) as f64));
+            let d = rotation * nalgebra::Vector3::new(x, y, 1.0);
+            let t0 = -origin.z / d.z;
+            [
+                (origin.x + t0 * d.x) as f32,
+                (origin.y + t0 * d.y) as f32,
+                (-d.x / d.z) as f32,
+                (-d.y / d.z) as f32,
+                t0 as f32,
+                (1.0 / d.z) as f32,
+            ]
+        });
+        Self { corners }
+    }
+
+    /// Ray, depth at height 0 and loss of depth per height at a place in the block, px from its first pixel's centre.
+    #[inline]
+    fn at(&self, x: f32, y: f32) -> (Ray, f32, f32) {
+        let (fx, fy) = (x / BLOCK as f32, y / BLOCK as f32);
+        let c = &self.corners;
+        let v: [f32; 6] = std::array::from_fn(|k| lerp(lerp(c[0][k], c[1][k], fx), lerp(c[2][k], c[3][k], fx), fy));
+        (
+            Ray {
+                at: [v[0], v[1]],
+                slope: [v[2], v[3]],
+            },
+            v[4],
+            v[5],
+        )
+    }
+}
+
+impl Prepared {
+    /// Makes a view ready.
+    pub fn new(view: &FaceView) -> Self {
+        let mut rng = Pcg64Mcg::seed_from_u64(view.scene_seed);
+        let lighting = Lighting::sample(&mut rng);
+        let mut sheetwork = view.design.sheetwork.clone();
+        crate::backdrop::surround(&mut sheetwork, &view.design, &mut rng);
+        let mut layers = sheetwork.layers;
+        layers.sort_by(|a, b| b.top_mm.total_cmp(&a.top_mm));
+        let mut spots: Vec<Spot> = Vec::new();
+        for screw in &view.design.screws {
+            let mut placed = screw.placed.clone();
+            if view.removed_screws.contains(&screw.id) {
+                placed.item = empty_hole(&screw.placed.item);
+            }
+            spots.push(Spot::new(placed, &layers));
+        }
+        spots.extend(view.design.decoys.iter().map(|d| Spot::new(d.clone(), &layers)));
+        Self {
+            view: view.clone(),
+            layers,
+            tubes: sheetwork.tubes,
+            spots,
+            lighting,
+        }
+    }
+
+    /// The view.
+    pub fn view(&self) -> &FaceView {
+        &self.view
+    }
+
+    pub(crate) fn relief<'a>(&'a self, spot: &'a Spot) -> &'a Relief {
+        spot.relief.get_or_init(|| {
+            let paint = &self.layers[spot.layer].paint;
+            let finish = SheetFinish {
+                albedo: paint.albedo,
+                roughness: paint.roughness,
+                metallic: paint.metallic(),
+            };
+            bake(&spot.placed.item, &finish)
+        })
+    }
+
+    /// Whether a sheet, bar or cable stands between the camera and a place of an item.
+    pub(crate) fn hidden(&self, spot: &Spot, local_mm: [f32; 3]) -> bool {
+        let p: [f64; 3] = [
+            spot.placed.at_mm[0] + f64::from(local_mm[0]),
+            spot.placed.at_mm[1] + f64::from(local_mm[1]),
+            spot.placed.height_mm + f64::from(local_mm[2]),
+        ];
+        let face_from_camera = self.view.camera_from_face.inverse();
+        let eye = face_from_camera.isometry().translation.vector;
+        // the eye's height is -z: z runs into the sheet
+        let climb = -eye.z - p[2];
+        let slope = [((eye.x - p[0]) / climb) as f32, ((eye.y - p[1]) / climb) as f32];
+        let at = [
+            (p[0] - p[2] * f64::from(slope[0])) as f32,
+            (p[1] - p[2] * f64::from(slope[1])) as f32,
+        ];
+        let ray = Ray { at, slope };
+        let nearby = self.nearby_rays([ray; 4], false);
+        self.meet(&nearby, &ray).height > p[2] as f32 + 0.6
+    }
+
+    /// Renders the picture, or only a region of it.
+    pub fn render(&self, roi: Option<Roi>) -> Rendered {
+        crate::sensor::expose(self, roi.unwrap_or(self.whole()), true)
+    }
+
+    /// As [`render`](Self::render), without blur, noise or compression: what a perfect camera would record.
+    pub fn render_ideal(&self, roi: Option<Roi>) -> Rendered {
+        crate::sensor::expose(self, roi.unwrap_or(self.whole()), false)
+    }
+
+    fn whole(&self) -> Roi {
+        Roi {
+            x_px: 0,
+            y_px: 0,
+            width_px: self.view.camera.width_px,
+            height_px: self.view.camera.height_px,
+        }
+    }
+
+    /// Renders the block whose first pixel is (x, y); both are multiples of [`BLOCK`] and may be negative.
+    pub(crate) fn block(&self, x_px: i64, y_px: i64) -> Block {
+        let rays = Rays::new(&self.view, x_px, y_px);
+        let nearby = self.nearby(&rays);
+        let mut out = Block {
+            color: [[0.0; 3]; BLOCK * BLOCK],
+            depth_mm: [0.0; BLOCK * BLOCK],
+        };
+        // First look: what each pixel's centre meets, with one pixel around to see where surfaces end.
+        const WIDE: usize = BLOCK + 2;
+        let nothing = Hit {
+            height: 0.0,
+            at: [0.0; 2],
+            layer: usize::MAX,
+            part: Part::Nothing,
+        };
+        let mut hits = [nothing; WIDE * WIDE];
+        for (i, hit) in hits.iter_mut().enumerate() {
+            let (x, y) = ((i % WIDE) as f32 - 1.0, (i / WIDE) as f32 - 1.0);
+            *hit = self.meet(&nearby, &rays.at(x, y).0);
+        }
+        for y in 0..BLOCK {
+            for x in 0..BLOCK {
+                let i = (y + 1) * WIDE + x + 1;
+                let hit = &hits[i];
+                let edge = [i - 1, i + 1, i - WIDE, i + WIDE]
+                    .iter()
+                    .any(|&j| !hits[j].same_surface(hit) || (hits[j].height - hit.height).abs() > 1.5);
+                let (ray, t0, dt) = rays.at(x as f32, y as f32);
+                let on_item = nearby.spots.iter().any(|(spot, relief)| {
+                    let p = ray.at_height(spot.placed.height_mm as f32);
+                    let (dx, dy) = (p[0] - spot.placed.at_mm[0] as f32, p[1] - spot.placed.at_mm[1] as f32);
+                    relief.contains(dx, dy)
+                });
+                let samples = if on_item { 3 } else if edge { 3 } else { 1 };
+                let mut sum = [0.0f32; 3];
+                let mut depth = 0.0;
+                for sy in 0..samples {
+                    for sx in 0..samples {
+                        let offset = |s: usize| (s as f32 + 0.5) / samples as f32 - 0.5;
+                        let (px, py) = (x as f32 + offset(sx), y as f32 + offset(sy));
+                        let (color, height) = if samples == 1 {
+                            self.color(&nearby, &ray, *hit)
+                        } else {
+                            let ray = rays.at(px, py).0;
+                            self.color(&nearby, &ray, self.meet(&nearby, &ray))
+                        };
+                        for k in 0..3 {
+                            sum[k] += color[k];
+                        }
+                        depth += t0 - height * dt;
+                    }
+                }
+                let scale = 1.0 / (samples * samples) as f32;
+                out.color[y * BLOCK + x] = sum.map(|v| v * scale);
+                out.depth_mm[y * BLOCK + x] = depth * scale;
+            }
+        }
+        out
+    }
+
+    fn nearby(&self, rays: &Rays) -> Nearby<'_> {
+        self.nearby_rays(
+            [(-1.0, -1.0), (17.0, -1.0), (-1.0, 17.0), (17.0, 17.0)].map(|(x, y)| rays.at(x, y).0),
+            true,
+        )
+    }
+
+    fn nearby_rays(&self, corners: [Ray; 4], items: bool) -> Nearby<'_> {
+        let seen = |low: f32, high: f32| {
+            Bounds::of_points(corners.iter().flat_map(|r| [r.at_height(low), r.at_height(high)]))
+        };
+        let mut layers = Vec::new();
+        for (index, layer) in self.layers.iter().enumerate() {
+            let here = seen(layer.top_mm - layer.wall_mm - 3.0, layer.top_mm + 12.0);
+            if !layer.bounds.grown(SHADOW_MM).meets(&here) {
+                continue;
+            }
+            let cutouts = layer.cutouts.iter().filter(|c| c.bounds.grown(SHADOW_MM).meets(&here));
+            let bumps = layer.bumps.iter().filter(|b| b.bounds().meets(&here));
+            layers.push(Near {
+                index,
+                layer,
+                cutouts: cutouts.collect(),
+                bumps: bumps.collect(),
+            });
+        }
+        let mut segments = Vec::new();
+        for (t, tube) in self.tubes.iter().enumerate() {
+            for (s, pair) in tube.points.windows(2).enumerate() {
+                let here = seen(pair[0][2].min(pair[1][2]) - tube.radius, pair[0][2].max(pair[1][2]) + tube.radius);
+                let bounds = Bounds::of_points(pair.iter().map(|p| [p[0], p[1]]));
+                if bounds.grown(tube.radius + 25.0).meets(&here) {
+                    segments.push((t, s));
+                }
+            }
+        }
+        let spots = self
+            .spots
+            .iter()
+            .filter(|spot| {
+                if !items {
+                    return false;
+                }
+                let h = spot.placed.height_mm as f32;
+                spot.bounds.meets(&seen(h - 8.0, h + 8.0))
+            })
+            .map(|spot| (spot, self.relief(spot)))
+            .collect();
+        Nearby {
+            layers,
+            segments,
+            spots,
+        }
+    }
+
+    /// The first sheet, wall or tube that a ray meets.
+    fn meet(&self, nearby: &Nearby, ray: &Ray) -> Hit {
+        let mut best = Hit {
+            height: -5000.0,
+            at: ray.at_height(-5000.0),
+            layer: usize::MAX,
+            part: Part::Nothing,
+        };
+        for &(t, s) in &nearby.segments {
+            let tube = &self.tubes[t];
+            let (a, b) = (tube.points[s], tube.points[s + 1]);
+            let mut foot = segment_foot(a, b, ray.at_height(0.5 * (a[2] + b[2])));
+            foot = segment_foot(a, b, ray.at_height(foot.height));
+            if foot.distance < tube.radius {
+                let height = foot.height + (tube.radius * tube.radius - foot.distance * foot.distance).sqrt();
+                if height > best.height {
+                    best = Hit {
+                        height,
+                        at: ray.at_height(height),
+                        layer: t,
+                        part: Part::Tube,
+                    };
+                }
+            }
+        }
+        for near in &nearby.layers {
+            let layer = near.layer;
+            // Layers come from the highest down.
+            if best.height >= layer.top_mm + 10.0 {
+                break;
+            }
+            let mut height = layer.top_mm;
+            let mut p = ray.at_height(height);
+            let outside = layer.shape.distance(p);
+            if outside > 0.0 {
+                if layer.wall_mm <= 0.0 {
+                    continue;
+                }
+                let low = height - layer.wall_mm;
+                if layer.shape.distance(ray.at_height(low)) < 0.0
+                    && let Some(h) = crossing(height, low, |h| layer.shape.distance(ray.at_height(h)))
+                    && h > best.height
+                {
+                    best = Hit {
+                        height: h,
+                        at: ray.at_height(h),
+                        layer: near.index,
+                        part: Part::Wall,
+                    };
+                }
+                continue;
+            }
+            let mut open = false;
+            for (c, cutout) in near.cutouts.iter().enumerate() {
+                if cutout.shape.distance(p) < 0.0 {
+                    open = true;
+                    let low = height - cutout.wall_mm;
+                    if cutout.shape.distance(ray.at_height(low)) > 0.0
+                        && let Some(h) = crossing(height, low, |h| -cutout.shape.distance(ray.at_height(h)))
+                        && h > best.height
+                    {
+                        best = Hit {
+                            height: h,
+                            at: ray.at_height(h),
+                            layer: near.index,
+                            part: Part::Cut(c),
+                        };
+                    }
+                    break;
+                }
+            }
+            if open {
+                continue;
+            }
+            if !near.bumps.is_empty() || layer.edge_mm > 0.0 {
+                for _ in 0..2 {
+                    height = layer.top_mm + near.rise(p);
+                    p = ray.at_height(height);
+                }
+            }
+            if height > best.height {
+                best = Hit {
+                    height,
+                    at: p,
+                    layer: near.index,
+                    part: Part::Top,
+                };
+            }
+        }
+        best
+    }
+
+    /// Radiance along a ray whose first sheet is known, and the height at which it ends.
+    fn color(&self, nearby: &Nearby, ray: &Ray, hit: Hit) -> ([f32; 3], f32) {
+        let view = unit([ray.slope[0], ray.slope[1], 1.0]);
+        let mut point = [hit.at[0], hit.at[1], hit.height];
+        let (mut material, mut normal) = self.surface(nearby, &hit);
+        let mut open = 1.0;
+        let mut on_spot = None;
+        for (k, (spot, relief)) in nearby.spots.iter().enumerate() {
+            let base = spot.placed.height_mm as f32;
+            let (x, y) = (spot.placed.at_mm[0] as f32, spot.placed.at_mm[1] as f32);
+            let p = ray.at_height(base);
+            if !relief.contains(p[0] - x, p[1] - y) {
+                continue;
+            }
+            let start = [p[0] - x, p[1] - y, 0.0];
+            let Some(q) = relief.march(start, [-ray.slope[0], -ray.slope[1], -1.0]) else {
+                continue;
+            };
+            let (own, cover) = relief.material(q[0], q[1]);
+            let mounted = hit.layer == spot.layer && hit.part == Part::Top;
+            if !(mounted || base + q[2] > hit.height - 0.05 && (q[2].abs() > 0.03 || cover > 0.05)) {
+                continue;
+            }
+            if base + q[2] < hit.height - 0.3 && !mounted {
+                continue;
+            }
+            material = blend(&material, &own, cover);
+            normal = relief.normal(q[0], q[1]);
+            open = relief.open(q[0], q[1]);
+            point = [q[0] + x, q[1] + y, base + q[2]];
+            on_spot = Some(k);
+            break;
+        }
+        open *= self.openness(nearby, &hit, point);
+        let mut visible = [1.0f32; 8];
+        for (light, seen) in self.lighting.lights.iter().zip(&mut visible) {
+            let incoming = light.at(point);
+            if dot(incoming.toward, normal) < -0.5 {
+                *seen = 0.0;
+                continue;
+            }
+            *seen = self.lit(nearby, &hit, point, incoming.toward, incoming.softness);
+            for (k, (spot, relief)) in nearby.spots.iter().enumerate() {
+                if *seen <= 0.0 {
+                    break;
+                }
+                let local = [
+                    point[0] - spot.placed.at_mm[0] as f32,
+                    point[1] - spot.placed.at_mm[1] as f32,
+                    point[2] - spot.placed.height_mm as f32,
+                ];
+                if on_spot.is_none() && hit.layer != spot.layer && local[2] < -1.0 || on_spot.is_some_and(|s| s != k) {
+                    continue;
+                }
+                *seen *= relief.visibility(local, incoming.toward, incoming.softness);
+            }
+        }
+        let count = self.lighting.lights.len().min(8);
+        let color = self
+            .lighting
+            .radiance(&material, normal, view, &visible[..count], open, point);
+        (color, point[2])
+    }
+
+    /// Material and normal of a sheet, wall or tube.
+    fn surface(&self, nearby: &Nearby, hit: &Hit) -> (Material, [f32; 3]) {
+        match hit.part {
+            Part::Nothing => (
+                Material {
+                    albedo: [0.05; 3],
+                    roughness: 1.0,
+                    metallic: 0.0,
+                },
+                [0.0, 0.0, 1.0],
+            ),
+            Part::Tube => {
+                let tube = &self.tubes[hit.layer];
+                let mut best: Option<crate::layer::TubeFoot> = None;
+                for &(t, s) in nearby.segments.iter().filter(|(t, _)| *t == hit.layer) {
+                    let tube = &self.tubes[t];
+                    let foot = segment_foot(tube.points[s], tube.points[s + 1], hit.at);
+                    if best.is_none_or(|b| foot.distance < b.distance) {
+                        best = Some(foot);
+                    }
+                }
+                let normal = best.map_or([0.0, 0.0, 1.0], |foot| {
+                    let side = (foot.distance / tube.radius).min(1.0);
+                    [
+                        foot.across[0] * side,
+                        foot.across[1] * side,
+                        (1.0 - side * side).sqrt(),
+                    ]
+                });
+                (tube.paint.at(hit.at), normal)
+            }
+            Part::Top | Part::Wall | Part::Cut(_) => {
+                let layer = &self.layers[hit.layer];
+                let Some(near) = nearby.layers.iter().find(|n| n.index == hit.layer) else {
+                    return (layer.paint.at(hit.at), [0.0, 0.0, 1.0]);
+                };
+                let slope = |f: &dyn Fn(Xy) -> f32, step: f32| -> Xy {
+                    let [x, y] = hit.at;
+                    [
+                        (f([x + step, y]) - f([x - step, y])) / (2.0 * step),
+                        (f([x, y + step]) - f([x, y - step])) / (2.0 * step),
+                    ]
+                };
+                let normal = match hit.part {
+                    Part::Wall => {
+                        let g = slope(&|p| layer.shape.distance(p), 0.1);
+                        unit([g[0], g[1], 0.02])
+                    }
+                    Part::Cut(c) => {
+                        let g = slope(&|p| near.cutouts[c].shape.distance(p), 0.1);
+                        unit([-g[0], -g[1], 0.02])
+                    }
+                    _ if near.bumps.is_empty() && layer.edge_mm <= 0.0 => [0.0, 0.0, 1.0],
+                    _ => {
+                        let g = slope(&|p| near.rise(p), 0.15);
+                        unit([-g[0], -g[1], 1.0])
+                    }
+                };
+                (layer.paint.at(hit.at), normal)
+            }
+        }
+    }
+
+    /// Share of the surroundings that reaches a point between higher sheets.
+    fn openness(&self, nearby: &Nearby, hit: &Hit, point: [f32; 3]) -> f32 {
+        let mut open = 1.0;
+        for near in &nearby.layers {
+            let above = near.layer.top_mm - point[2];
+            if above < 0.4 {
+                break;
+            }
+            if near.index == hit.layer && hit.part == Part::Wall {
+                continue;
+            }
+            let outside = near.layer.shape.distance([point[0], point[1]]);
+            let reach = 0.45 * above.min(120.0) + 0.2;
+            if outside >= 0.0 {
+                open *= 1.0 - 0.5 * (-outside / reach).exp();
+            } else {
+                let gap = near.solid_distance([point[0], point[1]]).max(0.0);
+                open *= 1.0 - 0.8 * (-gap / reach).exp();
+            }
+        }
+        open
+    }
+
+    /// Share of a light that passes the sheets and tubes above a point.
+    fn lit(&self, nearby: &Nearby, hit: &Hit, point: [f32; 3], toward: [f32; 3], softness: f32) -> f32 {
+        let rise = toward[2].max(0.05);
+        let along = [toward[0] / rise, toward[1] / rise];
+        let mut lit = 1.0f32;
+        for near in &nearby.layers {
+            let above = near.layer.top_mm - point[2];
+            if above < 0.05 {
+                break;
+            }
+            let own = near.index == hit.layer;
+            let low = (above - near.layer.wall_mm).max(0.0);
+            let looks = if low < above - 2.0 && !own { 3 } else { 1 };
+            for k in 0..looks {
+                let s = lerp(above, low, k as f32 / 2.0);
+                let p = [point[0] + s * along[0], point[1] + s * along[1]];
+                let d = near.solid_distance(p);
+                let width = softness * s + 0.25;
+                lit = lit.min((0.5 + 0.5 * d / width).clamp(0.0, 1.0));
+            }
+            if lit <= 0.0 {
+                return 0.0;
+            }
+        }
+        for &(t, s) in &nearby.segments {
+            let tube = &self.tubes[t];
+            let (a, b) = (tube.points[s], tube.points[s + 1]);
+            let mean = 0.5 * (a[2] + b[2]) - point[2];
+            if mean < 0.5 * tube.radius || hit.part == Part::Tube && hit.layer == t {
+                continue;
+            }
+            let foot = segment_foot(a, b, [point[0] + mean * along[0], point[1] + mean * along[1]]);
+            let above = foot.height - point[2];
+            let foot = segment_foot(a, b, [point[0] + above * along[0], point[1] + above * along[1]]);
+            let width = softness * above + 0.25;
+            // A thin tube hides only its share of a wide light.
+            let share = (2.0 * tube.radius / (2.0 * width)).min(1.0);
+            let dark = (0.5 - 0.5 * (foot.distance - tube.radius) / width).clamp(0.0, 1.0);
+            lit = lit.min(1.0 - share * dark);
+        }
+        lit * lit * (3.0 - 2.0 * lit)
+    }
+}
+
+/// Farthest sideways that a higher sheet is looked for when shadows fall, mm.
+const SHADOW_MM: f32 = 60.0;
+
+/// Height between `high` and `low` at which a distance changes from positive to negative, by bisection.
+fn crossing(high: f32, low: f32, distance: impl Fn(f32) -> f32) -> Option<f32> {
+    let (mut outside, mut inside) = (high, low);
+    for _ in 0..12 {
+        let mid = 0.5 * (outside + inside);
+        if distance(mid) > 0.0 {
+            outside = mid;
+        } else {
+            inside = mid;
+        }
+    }
+    Some(inside)
+}
+
+fn blend(under: &Material, over: &Material, cover: f32) -> Material {
+    Material {
+        albedo: std::array::from_fn(|k| lerp(under.albedo[k], over.albedo[k], cover)),
+        roughness: lerp(under.roughness, over.roughness, cover),
+        metallic: lerp(under.metallic, over.metallic, cover),
+    }
+}
+
+fn dot(a: [f32; 3], b: [f32; 3]) -> f32 {
+    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+}
+
+fn unit(a: [f32; 3]) -> [f32; 3] {
+    let scale = 1.0 / dot(a, a).sqrt().max(1e-9);
+    a.map(|v| v * scale)
+}
+
+/// The hole that a screw leaves.
+fn empty_hole(item: &Item) -> Item {
+    Item {
+        kind: Kind::Decoy(Decoy::EmptyScrewHole),
+        ..item.clone()
+    }
+}
+
+impl Spot {
+    fn new(placed: Placed, layers: &[Layer]) -> Self {
+        let at = [placed.at_mm[0] as f32, placed.at_mm[1] as f32];
+        let height = placed.height_mm as f32;
+        let distance = |l: &Layer| (l.height(at) - height).abs() + 100.0 * l.shape.distance(at).max(0.0);
+        let layer = (0..layers.len())
+            .min_by(|&a, &b| distance(&layers[a]).total_cmp(&distance(&layers[b])))
+            .unwrap_or(0);
+        Self {
+            bounds: Bounds::around(at, [1.75 * placed.item.diameter_mm as f32 + 4.0; 2]),
+            layer,
+            placed,
+            relief: OnceLock::new(),
+        }
+    }
+}
