@@ -2,6 +2,7 @@
 
 pub mod config;
 pub mod device;
+pub mod journal;
 pub mod program;
 pub mod record;
 pub mod statistics;
