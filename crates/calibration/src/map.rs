@@ -1,0 +1,480 @@
+//! The map from camera to robot: fitted from pairs, kept in a file with all that made it, asked for points with their sigma.
+
+use crate::{
+    Figures, FitError, FitReport, Level, Pair, Rejected, Volume,
+    lattice::{Estimate, Grid, LEVELS, MAX_LEVERAGE, Model, Shape, believable, split},
+    pair,
+    rigid::{self, quantile},
+};
+use geometry::{Base, Camera, CameraModel, Point, Transform};
+use nalgebra::Vector3;
+use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
+use std::path::{Path, PathBuf};
+
+/// How a map is fitted.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Method {
+    /// One rigid motion: what hand-eye calibration gives.
+    Rigid,
+    /// One affine map: the paper's global linear map alone.
+    Affine,
+    /// The paper's Algorithm 2: global map, then second order among the 27 points around.
+    #[default]
+    Lattice,
+}
+
+impl Method {
+    /// Name in files and messages.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Rigid => "rigid",
+            Self::Affine => "affine",
+            Self::Lattice => "lattice",
+        }
+    }
+
+    /// Fewest pairs for which the fit and its held-out figures mean something.
+    fn fewest_pairs(self) -> usize {
+        match self {
+            Self::Rigid => 5,
+            Self::Affine => 8,
+            Self::Lattice => 20,
+        }
+    }
+}
+
+/// Whose map it is: a map is true for one arm and one camera only.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Identity {
+    /// The arm, as the cell's file names it.
+    pub arm: String,
+    /// The camera: see [`camera_identity`].
+    pub camera: String,
+}
+
+/// A name for a camera that changes whenever its intrinsics do, since pairs and queries must share them.
+pub fn camera_identity(model: &CameraModel) -> String {
+    let text = format!("{model:?}");
+    format!("sha256:{}", &hex(&Sha256::digest(text.as_bytes()))[..16])
+}
+
+/// What the user chooses about a fit, and what the file should remember.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Settings {
+    /// The method.
+    pub method: Method,
+    /// Exactly as published: no rejection, no fallback, steps between neighbourhoods. For comparison.
+    #[serde(default)]
+    pub as_published: bool,
+    /// The arm and the camera that the pairs come from.
+    pub identity: Identity,
+    /// When the pairs were taken, RFC 3339.
+    pub date: String,
+}
+
+/// Where a point lies with respect to the calibrated volume.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Hull {
+    /// Between calibrated points.
+    Inside,
+    /// Within one spacing outside, or where the neighbourhood is too thin to be sure.
+    Edge,
+    /// Beyond: never a target.
+    Outside,
+}
+
+/// A camera point in the robot's base frame, and how sure that is.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct MappedPoint {
+    /// Where to command the tool to go.
+    pub base: Point<Base>,
+    /// Standard deviation along each of the two axes across the viewing ray, mm: of the map and of one measurement such as the pairs'.
+    pub sigma_lateral_mm: f64,
+    /// Standard deviation along the viewing ray, mm: likewise.
+    pub sigma_depth_mm: f64,
+    /// Whether the point lies in the calibrated volume.
+    pub hull: Hull,
+}
+
+/// Why a map file cannot be used, and what to do about it.
+#[derive(Debug, thiserror::Error)]
+pub enum MapError {
+    /// The file could not be read.
+    #[error("cannot read map {path}: {source}; check the path, or fit one with `unscrew calibrate fit`")]
+    Read {
+        /// The file.
+        path: PathBuf,
+        /// The system's reason.
+        source: std::io::Error,
+    },
+    /// The file could not be written.
+    #[error("cannot write map: {0}")]
+    Write(#[from] geometry::FileError),
+    /// Not a map file, or a damaged one.
+    #[error("{path} is not a whole map file ({reason}); fit it again with `unscrew calibrate fit`")]
+    Format {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        reason: String,
+    },
+    /// A map of a later program.
+    #[error("{path} is a map of version {found}, this program reads up to {VERSION}; update it or fit the map again")]
+    Version {
+        /// The file.
+        path: PathBuf,
+        /// The version in the file.
+        found: u64,
+    },
+    /// A map that was fitted with another camera.
+    #[error("{path} was fitted for camera '{found}', not for '{wanted}'; calibrate with this camera")]
+    WrongCamera {
+        /// The file.
+        path: PathBuf,
+        /// The camera in the file.
+        found: String,
+        /// The camera of the cell.
+        wanted: String,
+    },
+    /// A map that was fitted with another arm.
+    #[error("{path} was fitted for arm '{found}', not for '{wanted}'; calibrate this arm")]
+    WrongArm {
+        /// The file.
+        path: PathBuf,
+        /// The arm in the file.
+        found: String,
+        /// The arm of the cell.
+        wanted: String,
+    },
+}
+
+const FORMAT: &str = "unscrew-map";
+const VERSION: u64 = 1;
+
+/// Standard deviation of one measurement about the map for each level of the fallback: across the ray and along it, mm.
+type Scales = [[f64; 2]; 4];
+
+/// A map from camera to base.
+#[derive(Clone, Debug)]
+pub struct Map {
+    file: MapFile,
+    model: Model,
+}
+
+/// What is written: the points that the map rests on; everything else follows from them.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+struct MapFile {
+    format: String,
+    version: u64,
+    made_by: String,
+    pairs_sha256: String,
+    settings: Settings,
+    held_out: Figures,
+    rejected: usize,
+    base_from_camera: Transform<Base, Camera>,
+    volume: Volume,
+    scales_mm: Scales,
+    grid: Grid,
+    points: Vec<Support>,
+}
+
+/// One accepted pair.
+#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
+struct Support {
+    id: u64,
+    camera: Point<Camera>,
+    command: Point<Base>,
+}
+
+impl Map {
+    /// Fits a map to pairs; rows that missed the marker are passed over.
+    ///
+    /// # Errors
+    /// [`FitError`]: too few points, all in a plane, duplicate ids, metres, swapped columns, a mirrored frame, no common motion.
+    pub fn fit(pairs: &[Pair], settings: &Settings) -> Result<(Self, FitReport), FitError> {
+        let method = settings.method;
+        let points = rigid::usable(pairs, method.fewest_pairs(), method.name())?;
+        let motion = rigid::robust_rigid(&points)?;
+        let nodes: Vec<_> = points.index.iter().map(|&i| pairs[i].node).collect();
+        let grid = Grid::over(&nodes, &points.command);
+        let keep = if settings.as_published {
+            vec![true; points.index.len()]
+        } else {
+            believable(&points, &motion, &grid)
+        };
+        let used: Vec<usize> = (0..keep.len()).filter(|&i| keep[i]).collect();
+        if used.len() < method.fewest_pairs() {
+            return Err(FitError::TooFew {
+                have: used.len(),
+                need: method.fewest_pairs(),
+                method: method.name(),
+            });
+        }
+        let camera: Vec<_> = used.iter().map(|&i| points.camera[i]).collect();
+        let command: Vec<_> = used.iter().map(|&i| points.command[i]).collect();
+        let model = Model::bake(shape(settings), grid, &camera, &command);
+
+        let ray = |i: usize| model.ray(camera[i]);
+        let held: Vec<Estimate> = model.leave_one_out(&camera, &command);
+        let errors: Vec<_> = held
+            .iter()
+            .enumerate()
+            .map(|(i, e)| (e.base - command[i], ray(i)))
+            .collect();
+        let rigid_errors: Vec<_> = (0..used.len())
+            .map(|i| {
+                (
+                    model.motion * nalgebra::Point3::from(camera[i]) - nalgebra::Point3::from(command[i]),
+                    ray(i),
+                )
+            })
+            .collect();
+        let mut rejected: Vec<Rejected> = (0..keep.len())
+            .filter(|&i| !keep[i])
+            .map(|i| {
+                let error = points.command[i] - model.estimate(points.camera[i]).base;
+                let (lateral_mm, depth_mm) = split(error, -model.ray(points.camera[i]));
+                Rejected {
+                    id: pairs[points.index[i]].id,
+                    residual_mm: error.norm(),
+                    lateral_mm,
+                    depth_mm,
+                }
+            })
+            .collect();
+        rejected.sort_by(|a, b| b.residual_mm.total_cmp(&a.residual_mm));
+
+        let mut report = FitReport {
+            n_pairs: pairs.len(),
+            n_invalid: pairs.len() - points.index.len(),
+            n_used: used.len(),
+            rejected,
+            spacing_mm: model.grid.spacing_mm(),
+            held_out: Figures::of(&errors),
+            rigid_only: Figures::of(&rigid_errors),
+            neighbourhoods: LEVELS.into_iter().zip(model.levels()).filter(|(_, n)| *n > 0).collect(),
+            notes: Vec::new(),
+        };
+        report.remark();
+        let support = |(&i, (c, t)): (&usize, (&Vector3<f64>, &Vector3<f64>))| Support {
+            id: pairs[points.index[i]].id,
+            camera: Point::from_vector(*c),
+            command: Point::from_vector(*t),
+        };
+        let (low, high) = command
+            .iter()
+            .fold((command[0], command[0]), |(l, h), p| (l.inf(p), h.sup(p)));
+        let file = MapFile {
+            format: FORMAT.into(),
+            version: VERSION,
+            made_by: concat!("unscrew ", env!("CARGO_PKG_VERSION")).into(),
+            pairs_sha256: format!("sha256:{}", hex(&Sha256::digest(pair::to_csv(pairs).as_bytes()))),
+            settings: settings.clone(),
+            held_out: report.held_out,
+            rejected: report.rejected.len(),
+            base_from_camera: Transform::from_isometry(model.motion),
+            volume: Volume::between(Point::from_vector(low), Point::from_vector(high)),
+            scales_mm: scales(&model, &camera, &command, &held),
+            grid: model.grid.clone(),
+            points: used.iter().zip(camera.iter().zip(&command)).map(support).collect(),
+        };
+        Ok((Self { file, model }, report))
+    }
+
+    /// Where a camera point is in the robot's base frame.
+    pub fn apply(&self, camera: Point<Camera>) -> MappedPoint {
+        let e = self.model.estimate(camera.vector());
+        let sigma = |component: usize| {
+            let variance: f64 = (0..LEVELS.len())
+                .map(|l| self.file.scales_mm[l][component].powi(2) * (e.share[l] + e.variance[l]))
+                .sum();
+            // nothing measured supports a point outside or in a hole: its sigma grows with the distance
+            variance.sqrt() * (1.0 + e.outside.max(e.nearest.clamp(1.0, 2.0) - 1.0))
+        };
+        MappedPoint {
+            base: Point::from_vector(e.base),
+            sigma_lateral_mm: sigma(0),
+            sigma_depth_mm: sigma(1),
+            hull: self.hull(&e),
+        }
+    }
+
+    fn hull(&self, e: &Estimate) -> Hull {
+        let leverage: f64 = e.variance.iter().sum();
+        // a point measured on the border falls on either side of it by noise
+        if e.outside <= 0.01 && e.nearest <= 1.2 && leverage <= MAX_LEVERAGE {
+            Hull::Inside
+        } else if e.outside <= 1.0 && e.nearest <= 2.0 {
+            Hull::Edge
+        } else {
+            Hull::Outside
+        }
+    }
+
+    /// Writes the map, aside and then renamed.
+    ///
+    /// # Errors
+    /// [`MapError::Write`].
+    pub fn save(&self, path: &Path) -> Result<(), MapError> {
+        let text = serde_json::to_vec(&self.file).map_err(|e| MapError::Format {
+            path: path.into(),
+            reason: e.to_string(),
+        })?;
+        Ok(geometry::write_aside(path, &text)?)
+    }
+
+    /// Reads a map.
+    ///
+    /// # Errors
+    /// [`MapError`]: no map file, a damaged one, or one of a later program.
+    pub fn load(path: &Path) -> Result<Self, MapError> {
+        let bytes = std::fs::read(path).map_err(|source| MapError::Read {
+            path: path.into(),
+            source,
+        })?;
+        let bad = |reason: String| MapError::Format {
+            path: path.into(),
+            reason,
+        };
+        #[derive(Deserialize)]
+        struct Head {
+            format: String,
+            version: u64,
+        }
+        let head: Head = serde_json::from_slice(&bytes).map_err(|e| bad(e.to_string()))?;
+        if head.format != FORMAT {
+            return Err(bad(format!("its format is '{}', not '{FORMAT}'", head.format)));
+        }
+        if head.version > VERSION {
+            return Err(MapError::Version {
+                path: path.into(),
+                found: head.version,
+            });
+        }
+        let file: MapFile = serde_json::from_slice(&bytes).map_err(|e| bad(e.to_string()))?;
+        if file.points.len() < file.settings.method.fewest_pairs() {
+            return Err(bad(format!("it holds only {} points", file.points.len())));
+        }
+        let camera: Vec<_> = file.points.iter().map(|p| p.camera.vector()).collect();
+        let command: Vec<_> = file.points.iter().map(|p| p.command.vector()).collect();
+        let model = Model::bake(shape(&file.settings), file.grid.clone(), &camera, &command);
+        Ok(Self { file, model })
+    }
+
+    /// Reads a map and makes sure that it belongs to this arm and this camera.
+    ///
+    /// # Errors
+    /// As for [`load`](Self::load), [`MapError::WrongCamera`], [`MapError::WrongArm`].
+    pub fn load_for(path: &Path, identity: &Identity) -> Result<Self, MapError> {
+        let map = Self::load(path)?;
+        let Identity { arm, camera } = map.identity();
+        if *camera != identity.camera {
+            return Err(MapError::WrongCamera {
+                path: path.into(),
+                found: camera.clone(),
+                wanted: identity.camera.clone(),
+            });
+        }
+        if *arm != identity.arm {
+            return Err(MapError::WrongArm {
+                path: path.into(),
+                found: arm.clone(),
+                wanted: identity.arm.clone(),
+            });
+        }
+        Ok(map)
+    }
+
+    /// The arm and the camera that the map is true for.
+    pub fn identity(&self) -> &Identity {
+        &self.file.settings.identity
+    }
+
+    /// How it was fitted.
+    pub fn settings(&self) -> &Settings {
+        &self.file.settings
+    }
+
+    /// Errors at points left out of the fit.
+    pub fn held_out(&self) -> &Figures {
+        &self.file.held_out
+    }
+
+    /// Hash of the pairs that it was fitted to (of their contract CSV).
+    pub fn pairs_sha256(&self) -> &str {
+        &self.file.pairs_sha256
+    }
+
+    /// Pairs that the map rests on.
+    pub fn n_used(&self) -> usize {
+        self.file.points.len()
+    }
+
+    /// The calibrated volume: the box of the accepted commands.
+    pub fn volume(&self) -> Volume {
+        self.file.volume
+    }
+
+    /// The rigid part of the map: good to some millimetres, for directions and for planning.
+    pub fn base_from_camera(&self) -> Transform<Base, Camera> {
+        self.file.base_from_camera
+    }
+
+    pub(crate) fn ray(&self, camera: Point<Camera>) -> Vector3<f64> {
+        self.model.ray(camera.vector())
+    }
+}
+
+fn shape(settings: &Settings) -> Shape {
+    Shape {
+        affine: settings.method != Method::Rigid,
+        local: settings.method == Method::Lattice,
+        published: settings.as_published,
+    }
+}
+
+/// Sigma of one measurement for each level: the error that 68.27 % of the held-out components do not exceed, each divided by
+/// what its own fit adds. A quantile, since the few large errors of a lens or of gears would make sigma too wide for the many.
+fn scales(model: &Model, camera: &[Vector3<f64>], command: &[Vector3<f64>], held: &[Estimate]) -> Scales {
+    const ONE_SIGMA: f64 = 0.6827;
+    let scale = |errors: Vec<(usize, Vector3<f64>, f64)>| -> Option<[f64; 2]> {
+        if errors.len() < 5 {
+            return None;
+        }
+        let (mut lateral, mut depth) = (Vec::new(), Vec::new());
+        for (i, error, leverage) in errors {
+            let (across, along) = split(error, model.ray(camera[i]));
+            let s = (1.0 + leverage).sqrt();
+            lateral.push(across / s);
+            depth.push(along.abs() / s);
+        }
+        // the length of two components is within 1.515 sigma in 68.27 % of cases
+        Some([quantile(lateral, ONE_SIGMA) / 1.5151, quantile(depth, ONE_SIGMA)])
+    };
+    let pure = |level: Level| -> Vec<(usize, Vector3<f64>, f64)> {
+        let l = level as usize;
+        let own = held.iter().enumerate().filter(|(_, e)| e.share[l] > 0.999);
+        own.map(|(i, e)| (i, e.base - command[i], e.variance[l])).collect()
+    };
+    let global = scale(model.leave_one_out_at(Level::Global, camera, command)).unwrap_or([1.0; 2]);
+    let mut scales = [global; 4];
+    if model.shape.local {
+        for level in [Level::Linear, Level::Wide, Level::Local] {
+            let own = pure(level);
+            let errors = if own.len() >= 50 {
+                own
+            } else {
+                model.leave_one_out_at(level, camera, command)
+            };
+            scales[level as usize] = scale(errors).unwrap_or(global);
+        }
+    }
+    scales
+}
+
+fn hex(bytes: &[u8]) -> String {
+    bytes.iter().map(|b| format!("{b:02x}")).collect()
+}
