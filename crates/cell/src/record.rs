@@ -9,29 +9,8 @@ use geometry::{Base, Camera, Point};
 use serde::{Deserialize, Serialize};
 use std::fmt;
 
-/// What the detector says of a candidate, as in `detect --json`.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Verdict {
-    /// A fastener that the mounted bit fits: may be acted on.
-    Screw,
-    /// A fastener with another drive: reported, not acted on.
-    Other,
-    /// A person should look: never acted on unattended.
-    Review,
-}
-
-/// Where a point lies with respect to the calibrated volume.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Hull {
-    /// Within it.
-    Inside,
-    /// At its border.
-    Edge,
-    /// Beyond it.
-    Outside,
-}
+pub use calibration::Hull;
+pub use vision::Verdict;
 
 /// A candidate on a face.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -153,9 +132,14 @@ impl ScrewAttempt {
     pub fn retries(&self) -> usize {
         self.bursts.len().saturating_sub(1)
     }
-    /// Out, as far as driver and camera say.
+    /// Out, as far as driver and camera say. A driver that did not answer is believed to have done it if the screw is gone; one that
+    /// slipped is not, since a worn recess may only have become hard to see.
     pub fn removed(&self) -> bool {
-        self.end() == Some(DriveEnd::Removed) && self.still_there != Some(true)
+        match self.end() {
+            Some(DriveEnd::Removed) => self.still_there != Some(true),
+            Some(DriveEnd::TimeOut) => self.still_there == Some(false),
+            _ => false,
+        }
     }
     /// Time spent on it, s.
     pub fn time_s(&self) -> f64 {
