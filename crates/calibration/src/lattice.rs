@@ -74,7 +74,7 @@ impl Surface {
         for c in 0..terms {
             let diagonal = normal[c][c];
             let pivot = diagonal - (0..c).map(|k| normal[c][k].powi(2)).sum::<f64>();
-            if !(pivot > 1e-10 * diagonal.max(1e-30)) {
+            if pivot.is_nan() || pivot <= 1e-10 * diagonal.max(1e-30) {
                 return None;
             }
             normal[c][c] = pivot.sqrt();

@@ -148,22 +148,21 @@ fn check_units(pairs: &[Pair], points: &Points) -> Result<(), FitError> {
 /// `depth_mm` is `cam_z_mm` under another name, and `u_px` grows with `cam_x_mm`: enough to notice exchanged columns.
 fn check_columns(pairs: &[Pair]) -> Result<(), FitError> {
     let valid = || pairs.iter().filter(|p| p.valid);
-    let with_depth: Vec<_> = valid()
-        .filter_map(|p| Some((p.depth_mm?, p.camera?, p.command)))
+    // depth_mm, then the columns that it could stand beside
+    let rows: Vec<[f64; 7]> = valid()
+        .filter_map(|p| {
+            let ([x, y, z], [a, b, c]) = (p.camera?.to_array(), p.command.to_array());
+            Some([p.depth_mm?, z, x, y, a, b, c])
+        })
         .collect();
-    if !with_depth.is_empty() {
-        let off = |get: &dyn Fn(&(f64, geometry::Point<geometry::Camera>, geometry::Point<geometry::Base>)) -> f64| {
-            median(with_depth.iter().map(|row| (row.0 - get(row)).abs()).collect())
-        };
-        let columns: [(&'static str, f64); 5] = [
-            ("cam_x_mm", off(&|r| r.1.x_mm())),
-            ("cam_y_mm", off(&|r| r.1.y_mm())),
-            ("cmd_x_mm", off(&|r| r.2.x_mm())),
-            ("cmd_y_mm", off(&|r| r.2.y_mm())),
-            ("cmd_z_mm", off(&|r| r.2.z_mm())),
-        ];
-        let as_it_should = off(&|r| r.1.z_mm());
-        let closest = columns.into_iter().min_by(|a, b| a.1.total_cmp(&b.1));
+    if !rows.is_empty() {
+        let off = |column: usize| median(rows.iter().map(|row| (row[0] - row[column]).abs()).collect());
+        let columns = ["cam_x_mm", "cam_y_mm", "cmd_x_mm", "cmd_y_mm", "cmd_z_mm"];
+        let closest = columns
+            .into_iter()
+            .zip((2..).map(off))
+            .min_by(|a, b| a.1.total_cmp(&b.1));
+        let as_it_should = off(1);
         if let Some((second, distance)) = closest
             && as_it_should > 5.0
             && distance < 2.0

@@ -435,3 +435,37 @@ fn the_same_pairs_give_the_same_map() {
     };
     assert_eq!(bytes("a"), bytes("b"));
 }
+
+#[test]
+fn a_coarse_lattice_is_enough_to_start_with() {
+    // what a first run takes the time for: 7 x 4 x 6 nodes at 150 mm, one missed and one outlier
+    let rng = &mut Pcg64Mcg::seed_from_u64(41);
+    let mut pairs = perfect(150.0, warped);
+    for p in &mut pairs {
+        let shift = if p.id == 60 { 9.0 } else { 0.0 };
+        let seen = measured(p.camera.expect("seen"), rng, 0.05, 0.1)
+            .moved(geometry::Direction::new(1.0, 0.0, 0.0).expect("a direction"), shift);
+        *p = pair(p.id, p.node, p.command, seen);
+        p.valid = p.id != 31;
+    }
+    let (map, report) = Map::fit(&pairs, &Settings::default()).expect("a map");
+    assert_eq!(report.rejected.iter().map(|r| r.id).collect::<Vec<_>>(), [60]);
+    let mut inside = 0;
+    for _ in 0..2000 {
+        let truth = anywhere(rng);
+        let found = map.apply(camera_from_base() * warped(truth));
+        inside += usize::from(found.hull == Hull::Inside);
+        assert!(found.base.distance_mm(truth) < 0.35, "{found:?}");
+    }
+    assert!(inside > 1900, "{inside}");
+
+    // the least that is accepted: 3 x 3 x 3, seven of them missed
+    let mut few = perfect(500.0, warped);
+    few.iter_mut().filter(|p| p.id % 4 == 1).for_each(|p| p.valid = false);
+    let (map, _) = Map::fit(&few, &Settings::default()).expect("a map");
+    let found = map.apply(camera_from_base() * warped(Point::new(1150.0, 0.0, 500.0)));
+    assert!(
+        found.base.distance_mm(Point::new(1150.0, 0.0, 500.0)) < 1.0,
+        "{found:?}"
+    );
+}
