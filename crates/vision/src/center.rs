@@ -168,7 +168,9 @@ fn edges(patch: &Patch, [x, y]: [f64; 2], radius: f64, span: std::ops::Range<f64
     if !strengths.is_empty() {
         let middle = strengths.len() / 2;
         let typical = *strengths.select_nth_unstable_by(middle, f64::total_cmp).1;
-        edges.iter_mut().for_each(|e| e.strength = e.strength.min(2.5 * typical));
+        edges
+            .iter_mut()
+            .for_each(|e| e.strength = e.strength.min(2.5 * typical));
     }
     edges
 }

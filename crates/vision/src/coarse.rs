@@ -5,6 +5,7 @@ use image::RgbImage;
 use nn::Network;
 
 use crate::Thresholds;
+use crate::components::{Run, area, components};
 use crate::layout::{COARSE_CHANNELS, COARSE_FASTENER, NOMINAL_HEAD_PX, STRIDE};
 use crate::picture::Rows;
 
@@ -61,10 +62,10 @@ pub fn coarse_map(network: &Network, picture: &RgbImage) -> ProbabilityMap {
 /// # Returns
 /// The candidates, most probable first.
 pub fn candidates(map: &ProbabilityMap, thresholds: &Thresholds) -> Vec<Candidate> {
-    let components = components(map, thresholds.coarse);
+    let inside = |x: usize, y: usize| map.probability[y * map.width + x] >= thresholds.coarse; // false for NaN
     let mut found = Vec::new();
-    for runs in components {
-        let cells: usize = runs.iter().map(|r| r.end - r.start).sum();
+    for runs in components(map.width, map.height, inside) {
+        let cells = area(&runs);
         if cells >= thresholds.coarse_min_cells.max(1) {
             peaks(map, &runs, cells, &mut found);
         }
@@ -75,65 +76,6 @@ pub fn candidates(map: &ProbabilityMap, thresholds: &Thresholds) -> Vec<Candidat
         |c| c.score,
         |_, _| APART * NOMINAL_HEAD_PX,
     )
-}
-
-/// Cells `start..end` of one row that are above the threshold.
-#[derive(Clone, Copy, Debug, PartialEq)]
-struct Run {
-    y: usize,
-    start: usize,
-    end: usize,
-}
-
-/// Connected components (8 neighbours) of the cells above the threshold, as runs joined by union-find.
-fn components(map: &ProbabilityMap, threshold: f32) -> Vec<Vec<Run>> {
-    let mut runs: Vec<Run> = Vec::new();
-    let mut parent: Vec<usize> = Vec::new();
-    let mut above = 0..0; // runs of the row above
-    let above_threshold = |p: f32| p >= threshold; // false for NaN
-    for (y, row) in map.probability.chunks_exact(map.width.max(1)).enumerate() {
-        let begin = runs.len();
-        let mut x = 0;
-        while x < row.len() {
-            if !above_threshold(row[x]) {
-                x += 1;
-                continue;
-            }
-            let start = x;
-            while x < row.len() && above_threshold(row[x]) {
-                x += 1;
-            }
-            let index = runs.len();
-            runs.push(Run { y, start, end: x });
-            parent.push(index);
-            for other in above.clone() {
-                if runs[other].start <= x && start <= runs[other].end {
-                    let (a, b) = (root(&mut parent, index), root(&mut parent, other));
-                    parent[a.max(b)] = a.min(b);
-                }
-            }
-        }
-        above = begin..runs.len();
-    }
-    let mut slot = vec![usize::MAX; runs.len()];
-    let mut components: Vec<Vec<Run>> = Vec::new();
-    for (i, run) in runs.iter().enumerate() {
-        let root = root(&mut parent, i);
-        if slot[root] == usize::MAX {
-            slot[root] = components.len();
-            components.push(Vec::new());
-        }
-        components[slot[root]].push(*run);
-    }
-    components
-}
-
-fn root(parent: &mut [usize], mut i: usize) -> usize {
-    while parent[i] != i {
-        parent[i] = parent[parent[i]];
-        i = parent[i];
-    }
-    i
 }
 
 /// Adds the local maxima of the smoothed probability in a component.
@@ -237,17 +179,6 @@ mod tests {
                 })
                 .collect(),
         }
-    }
-
-    #[test]
-    fn components_join_across_corners_and_bridges() {
-        let map = map(&["99..9", "..9..", "9...9", "9.9.9", "99999"]);
-        let mut cells: Vec<usize> = components(&map, 0.5)
-            .iter()
-            .map(|runs| runs.iter().map(|r| r.end - r.start).sum())
-            .collect();
-        cells.sort_unstable();
-        assert_eq!(cells, [1, 3, 10]); // two pieces touch at a corner; the U and its middle tooth are one
     }
 
     #[test]

@@ -28,12 +28,16 @@
 
 mod center;
 mod coarse;
+mod components;
 mod detect;
 mod fine;
 pub mod layout;
 mod locate;
+mod marker;
 mod model;
+mod overlay;
 mod picture;
+mod report;
 #[cfg(test)]
 mod synthetic;
 
@@ -42,4 +46,7 @@ pub use coarse::{Candidate, ProbabilityMap, candidates, coarse_map};
 pub use detect::{Detections, Detector, Drive, Options, Region, Screw, Timing, Verdict};
 pub use fine::{Clip, Evidence, look};
 pub use locate::{DepthSource, Located, locate};
+pub use marker::{LocatedMarker, Marker, MarkerError, MarkerSpec, find_marker, locate_marker};
 pub use model::{Corrections, Model, ModelError, Settings, Thresholds, decode_model, encode_model, model_id};
+pub use overlay::{overlay, verdict_color};
+pub use report::{Hull, ImageReport, Mapped, ScrewReport};

@@ -165,19 +165,21 @@ pub(crate) struct Patch {
 impl Patch {
     /// Cuts the luma (Rec. 709) out of the picture.
     pub fn cut(picture: &RgbImage, center: Pixel, half: usize) -> Self {
+        let luma = |[r, g, b]: [f32; 3]| (0.2126 * r + 0.7152 * g + 0.0722 * b) / 255.0;
+        Self::cut_as(picture, center, half, luma)
+    }
+
+    /// Cuts a function of the colour (0 to 255) out of the picture.
+    pub fn cut_as(picture: &RgbImage, center: Pixel, half: usize, grey_of: impl Fn([f32; 3]) -> f32) -> Self {
         let side = 2 * half + 1;
-        let corner = [
-            center.u_px.round() as i64 - half as i64,
-            center.v_px.round() as i64 - half as i64,
-        ];
+        let corner = [center.u_px, center.v_px].map(|c| c.round() as i64 - half as i64);
         let mut grey = Vec::with_capacity(side * side);
         let (width, height) = (i64::from(picture.width()), i64::from(picture.height()));
         for y in 0..side as i64 {
             let v = (corner[1] + y).clamp(0, height - 1) as u32;
             for x in 0..side as i64 {
                 let u = (corner[0] + x).clamp(0, width - 1) as u32;
-                let [r, g, b] = picture.get_pixel(u, v).0.map(f32::from);
-                grey.push((0.2126 * r + 0.7152 * g + 0.0722 * b) / 255.0);
+                grey.push(grey_of(picture.get_pixel(u, v).0.map(f32::from)));
             }
         }
         Self { side, grey, corner }
@@ -263,7 +265,7 @@ impl Patch {
         let limit = self.side as f64 - 1.001;
         let (x, y) = (x.clamp(0.0, limit), y.clamp(0.0, limit));
         let (ix, iy) = (x as usize, y as usize);
-        let (fx, fy) = ((x - ix as f64) as f32, (y - iy as f32 as f64) as f32);
+        let (fx, fy) = ((x - ix as f64) as f32, (y - iy as f64) as f32);
         let i = iy * self.side + ix;
         let top = self.grey[i] + fx * (self.grey[i + 1] - self.grey[i]);
         let bottom = self.grey[i + self.side] + fx * (self.grey[i + self.side + 1] - self.grey[i + self.side]);
