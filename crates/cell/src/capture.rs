@@ -60,19 +60,19 @@ pub async fn present(devices: &Devices, face: &FaceId, timeout_s: f64) -> Result
     }
 }
 
-/// Takes a shot of the whole view or of a region; depth is the mean of `depth_frames` frames.
+/// Takes a shot of the whole view or of a region; depth is the mean of `depth_frames` frames, none for 0.
 ///
 /// # Errors
-/// What a camera says; a grab that timed out is tried once more, since taking a picture changes nothing.
+/// What a camera says; a grab that failed is tried once more, since taking a picture changes nothing.
 pub async fn shoot(devices: &Devices, region: Option<Region>, depth_frames: usize) -> Result<Shot, DeviceError> {
     let color = match devices.color.grab(region).await {
-        Err(DeviceError::Timeout { .. }) => devices.color.grab(region).await?,
+        Err(DeviceError::Timeout { .. } | DeviceError::Fault { .. }) => devices.color.grab(region).await?,
         other => other?,
     };
     let mut mean: Option<Mean> = None;
-    for _ in 0..depth_frames.max(1) {
+    for _ in 0..depth_frames {
         let frame = match devices.depth.grab(region).await {
-            Err(DeviceError::Timeout { .. }) => devices.depth.grab(region).await?,
+            Err(DeviceError::Timeout { .. } | DeviceError::Fault { .. }) => devices.depth.grab(region).await?,
             other => other?,
         };
         check_registered(&color, &frame)?;
@@ -174,6 +174,40 @@ pub fn region_around(camera: &CameraModel, pixel: Pixel, half_px: f64) -> Option
         width_px,
         height_px,
     })
+}
+
+/// What a picture costs beyond its pixels (trigger, transfer, a pass of the networks), as pixels, Mpx.
+const PICTURE_COST_MPX: f64 = 1.0;
+
+/// Few regions that together show everything around some pixels: two are joined where one picture costs less than two.
+pub fn regions_around(camera: &CameraModel, pixels: &[Pixel], half_px: f64) -> Vec<Region> {
+    let mut regions: Vec<Region> = pixels.iter().filter_map(|p| region_around(camera, *p, half_px)).collect();
+    let cost = |r: &Region| PICTURE_COST_MPX + f64::from(r.width_px) * f64::from(r.height_px) * 1e-6;
+    loop {
+        let mut best: Option<(f64, usize, usize, Region)> = None;
+        for i in 0..regions.len() {
+            for j in i + 1..regions.len() {
+                let joined = join(&regions[i], &regions[j]);
+                let saved = cost(&regions[i]) + cost(&regions[j]) - cost(&joined);
+                if saved > 0.0 && best.as_ref().is_none_or(|b| saved > b.0) {
+                    best = Some((saved, i, j, joined));
+                }
+            }
+        }
+        let Some((_, i, j, joined)) = best else { return regions };
+        regions.swap_remove(j);
+        regions[i] = joined;
+    }
+}
+
+fn join(a: &Region, b: &Region) -> Region {
+    let (x_px, y_px) = (a.x_px.min(b.x_px), a.y_px.min(b.y_px));
+    Region {
+        x_px,
+        y_px,
+        width_px: (a.x_px + a.width_px).max(b.x_px + b.width_px) - x_px,
+        height_px: (a.y_px + a.height_px).max(b.y_px + b.height_px) - y_px,
+    }
 }
 
 /// The plane that most of a face lies in. In inverse depth a plane is linear over the picture, whatever its tilt.
@@ -329,5 +363,22 @@ mod tests {
         let local = Pixel::new(pixel.u_px - f64::from(region.x_px), pixel.v_px - f64::from(region.y_px));
         assert_eq!(part.ray(local), whole.ray(pixel));
         assert!(region_around(&whole, Pixel::new(-500.0, 10.0), 100.0).is_none());
+    }
+
+    #[test]
+    fn neighbours_share_a_picture_and_every_pixel_is_in_one() {
+        let camera = CameraModel::pinhole(4104, 3006, 4638.0, 4638.0);
+        let pixels: Vec<Pixel> = [(500.0, 300.0), (900.0, 310.0), (1300.0, 305.0), (3800.0, 2900.0)]
+            .map(|(u, v)| Pixel::new(u, v))
+            .to_vec();
+        let regions = regions_around(&camera, &pixels, 100.0);
+        assert_eq!(regions.len(), 2, "{regions:?}");
+        let shown = |p: &Pixel, r: &Region| {
+            (p.u_px - f64::from(r.x_px)) >= 90.0
+                && (p.v_px - f64::from(r.y_px)) >= 90.0
+                && p.u_px + 90.0 <= f64::from(r.x_px + r.width_px)
+                && p.v_px + 90.0 <= f64::from(r.y_px + r.height_px)
+        };
+        assert!(pixels.iter().all(|p| regions.iter().any(|r| shown(p, r))), "{regions:?}");
     }
 }

@@ -346,7 +346,7 @@ mod tests {
     use crate::record::Act;
 
     fn arrived() -> Event {
-        Event::Arrived {
+        Event::Identified {
             model: Some("CU-X22".into()),
         }
     }
@@ -365,7 +365,7 @@ mod tests {
         let unit = journal.unfinished()?.expect("unit 1 is under way");
         let record = journal.unit(unit)?.expect("unit 1");
         assert_eq!((record.unit, record.open), (1, Some(act)));
-        assert_eq!((record.model.as_deref(), record.times.waiting_s), (Some("CU-X22"), 2.0));
+        assert_eq!((record.model.as_deref(), record.times.waiting_s), (Some("CU-X22"), 0.0));
         assert_eq!(journal.unit(7)?, None);
         let mode: String = journal
             .connection
@@ -421,7 +421,7 @@ mod tests {
             .connection
             .pragma_update(None, "max_page_count", pages)
             .expect("limit");
-        let long = Event::Arrived {
+        let long = Event::Identified {
             model: Some("x".repeat(100_000)),
         };
         let error = journal.append(unit, 1.0, &long).expect_err("full").to_string();

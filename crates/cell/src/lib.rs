@@ -7,4 +7,6 @@ pub mod journal;
 pub mod plan;
 pub mod program;
 pub mod record;
+pub mod removal;
+pub mod run;
 pub mod statistics;

@@ -246,6 +246,8 @@ pub enum NgReason {
     ScrewOutOfReach,
     /// A device failed or did not answer.
     DeviceFault,
+    /// It was taken off the table while the program was down.
+    TakenAway,
 }
 
 /// Why a unit was not begun.
@@ -393,7 +395,9 @@ pub enum Act {
 #[serde(tag = "event", rename_all = "snake_case")]
 pub enum Event {
     /// The unit stands on the table.
-    Arrived {
+    Arrived,
+    /// Its plate was read.
+    Identified {
         /// Its model number, if it could be read.
         model: Option<String>,
     },
@@ -435,6 +439,8 @@ pub enum Event {
         /// How.
         cover: CoverRecord,
     },
+    /// The gripper has laid its cover aside.
+    LaidAside,
     /// From here on (or no longer) time is spent on making something good.
     Recovery {
         /// Beginning or end.
@@ -458,7 +464,8 @@ impl Event {
     /// Its name in the journal's `kind` column.
     pub fn kind(&self) -> &'static str {
         match self {
-            Self::Arrived { .. } => "arrived",
+            Self::Arrived => "arrived",
+            Self::Identified { .. } => "identified",
             Self::Resumed => "resumed",
             Self::Intent { .. } => "intent",
             Self::Presented { .. } => "presented",
@@ -466,6 +473,7 @@ impl Event {
             Self::Driven { .. } => "driven",
             Self::Verified { .. } => "verified",
             Self::Pulled { .. } => "pulled",
+            Self::LaidAside => "laid_aside",
             Self::Recovery { .. } => "recovery",
             Self::StepDone { .. } => "step_done",
             Self::Decided { .. } => "decided",
@@ -476,10 +484,10 @@ impl Event {
     /// What the time since the event before was spent on.
     fn resource(&self) -> Resource {
         match self {
-            Self::Arrived { .. } | Self::Resumed => Resource::Waiting,
-            Self::Presented { .. } | Self::Discharged => Resource::Handling,
+            Self::Arrived | Self::Resumed => Resource::Waiting,
+            Self::Identified { .. } | Self::Presented { .. } | Self::Discharged => Resource::Handling,
             Self::Driven { .. } => Resource::Screws,
-            Self::Pulled { .. } => Resource::Covers,
+            Self::Pulled { .. } | Self::LaidAside => Resource::Covers,
             Self::Intent {
                 act: Act::Present { .. } | Act::Discharge,
             } => Resource::Handling,
@@ -569,7 +577,8 @@ impl UnitRecord {
         self.times.add(resource, spent_s);
         self.last_s = t_s;
         match event {
-            Event::Arrived { model } => self.model.clone_from(model),
+            Event::Arrived | Event::LaidAside => {}
+            Event::Identified { model } => self.model.clone_from(model),
             Event::Resumed => {
                 self.resumed += 1;
                 self.recovering = false;
@@ -674,7 +683,7 @@ mod tests {
     #[test]
     fn times_add_up_to_the_clock_and_go_where_they_belong() {
         let events = [
-            (10.0, Event::Arrived { model: None }),
+            (10.0, Event::Arrived),
             (10.0, Event::Intent { act: Act::Present { face: "front".into() } }),
             (15.0, Event::Presented { face: "front".into() }),
             (17.0, Event::Seen { face: face() }),

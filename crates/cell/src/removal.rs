@@ -1,0 +1,250 @@
+//! One screw: approach, drive, retreat; and the moves of the arms, none of which is ever sent twice.
+
+use crate::config::{Approach, Drive, Timeouts};
+use crate::device::{Arm, ArmState, Clock, DeviceError, DriveEnd, DriveProgram, DriverTool, Motion, RobotArm, Ticket, jobs};
+use crate::plan::SafeTarget;
+use crate::record::Burst;
+use geometry::{Base, Tool, Transform};
+use std::sync::Arc;
+
+/// Position and angle within which an arm counts as arrived, when only its state can tell.
+const ARRIVED_MM: f64 = 0.5;
+const ARRIVED_RAD: f64 = 0.005;
+/// Time between two looks at the state of an arm that is under way, s.
+const POLL_S: f64 = 0.05;
+
+/// What a failed or doubtful burst allows to be tried next; once a screw, and only where the cause can be met.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Retry {
+    /// Look again with a region of the picture, map again, and drive with this programme if the screw still stands.
+    LookAgain(DriveProgram),
+    /// Drive again at the same place with this programme.
+    Harder(DriveProgram),
+}
+
+/// The ladder: what may be tried after a burst that ended like this.
+pub fn retry_after(end: Option<DriveEnd>, drive: &Drive) -> Option<Retry> {
+    match end {
+        Some(DriveEnd::Removed) => None,
+        Some(DriveEnd::MissedHead) => Some(Retry::LookAgain(drive.first)),
+        Some(DriveEnd::CamOut) => Some(Retry::Harder(drive.after_cam_out)),
+        Some(DriveEnd::Seized) => Some(Retry::Harder(drive.after_seized)),
+        // the screw may be out, half out or untouched: only a picture tells
+        Some(DriveEnd::TimeOut) => Some(Retry::LookAgain(drive.after_seized)),
+        None => Some(Retry::LookAgain(drive.first)),
+    }
+}
+
+/// An arm with the limits of its moves.
+pub struct Mover<'a> {
+    /// The arm.
+    pub arm: &'a Arm,
+    /// How it comes to a screw.
+    pub approach: Approach,
+    /// How long anything may take.
+    pub timeouts: Timeouts,
+    /// The cell's clock.
+    pub clock: &'a Arc<dyn Clock>,
+}
+
+impl std::fmt::Debug for Mover<'_> {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Mover").field("arm", &self.robot().name()).finish_non_exhaustive()
+    }
+}
+
+impl Mover<'_> {
+    fn robot(&self) -> &dyn RobotArm {
+        self.arm.robot.as_ref()
+    }
+
+    /// The state, if it is fresh and the arm may be moved.
+    ///
+    /// # Errors
+    /// [`DeviceError::Stale`] or [`DeviceError::NotReady`].
+    pub async fn ready(&self) -> Result<ArmState, DeviceError> {
+        let state = self.robot().state().await?;
+        let device = || self.robot().name().to_owned();
+        if state.age_s > self.timeouts.state_age_s {
+            return Err(DeviceError::Stale {
+                device: device(),
+                age_s: state.age_s,
+            });
+        }
+        match trouble(&state) {
+            Some(state) => Err(DeviceError::NotReady {
+                device: device(),
+                state,
+            }),
+            None => Ok(state),
+        }
+    }
+
+    /// One burst at a target: in front of it, straight in, drive, straight back. The bit comes back whatever the driver says; an
+    /// error of arm or driver is in the burst.
+    pub async fn burst(&self, target: &SafeTarget, program: DriveProgram) -> Burst {
+        let begin_s = self.clock.now_s();
+        let mut burst = Burst {
+            program: None,
+            end: None,
+            error: None,
+            aim: target.tip(),
+            second_look: None,
+            time_s: 0.0,
+        };
+        if let Err(error) = self.burst_into(target, program, &mut burst).await {
+            burst.error.get_or_insert(error.to_string());
+        }
+        burst.time_s = self.clock.now_s() - begin_s;
+        burst
+    }
+
+    async fn burst_into(&self, target: &SafeTarget, program: DriveProgram, burst: &mut Burst) -> Result<(), DeviceError> {
+        let Some(driver) = &self.arm.driver else {
+            return Err(DeviceError::Refused {
+                device: self.robot().name().into(),
+                reason: "it carries no driver".into(),
+            });
+        };
+        self.ready().await?;
+        self.to_standoff(target, Motion::Joint).await?;
+        let worked = self.work(driver, target, program, burst).await;
+        let back = Motion::Linear {
+            speed_mm_s: self.approach.retract_mm_s,
+        };
+        worked.and(self.to_standoff(target, back).await)
+    }
+
+    /// From in front of the screw: in, and drive.
+    async fn work(
+        &self,
+        driver: &Arc<dyn DriverTool>,
+        target: &SafeTarget,
+        program: DriveProgram,
+        burst: &mut Burst,
+    ) -> Result<(), DeviceError> {
+        let speed_mm_s = self.approach.approach_mm_s;
+        self.to_contact(target, Motion::Linear { speed_mm_s }).await?;
+        burst.program = Some(program);
+        let driven = driver.drive(program).await;
+        burst.end = match &driven {
+            Ok(result) => Some(result.end),
+            // it may have worked: a picture will tell, the programme is not started again
+            Err(DeviceError::Timeout { .. }) => Some(DriveEnd::TimeOut),
+            Err(_) => None,
+        };
+        driven.map(|_| ())
+    }
+
+    async fn to_standoff(&self, target: &SafeTarget, motion: Motion) -> Result<(), DeviceError> {
+        self.go(target.standoff_pose(), motion).await
+    }
+
+    async fn to_contact(&self, target: &SafeTarget, motion: Motion) -> Result<(), DeviceError> {
+        self.go(target.contact_pose(), motion).await
+    }
+
+    /// The only place that sends a move. Private: poses come from [`SafeTarget`]s alone.
+    async fn go(&self, pose: Transform<Base, Tool>, motion: Motion) -> Result<(), DeviceError> {
+        match self.robot().move_to(pose, motion).await {
+            Ok(ticket) => self.arrive(ticket, Some(pose)).await,
+            // it may be under way: what follows reads, it does not send again
+            Err(lost @ DeviceError::Timeout { .. }) => self.settle(lost, Some(pose)).await,
+            Err(error) => Err(error),
+        }
+    }
+
+    /// Runs a job of the controller to its end.
+    ///
+    /// # Errors
+    /// What the arm says; after a time-out, only if the arm does not come to rest in order.
+    pub async fn job(&self, job: &str) -> Result<(), DeviceError> {
+        match self.robot().run_job(job).await {
+            Ok(ticket) => self.arrive(ticket, None).await,
+            Err(lost @ DeviceError::Timeout { .. }) => self.settle(lost, None).await,
+            Err(error) => Err(error),
+        }
+    }
+
+    /// Sends the arm out of the way of table and camera.
+    ///
+    /// # Errors
+    /// As for [`job`](Self::job).
+    pub async fn home(&self) -> Result<(), DeviceError> {
+        self.job(jobs::HOME).await
+    }
+
+    async fn arrive(&self, ticket: Ticket, pose: Option<Transform<Base, Tool>>) -> Result<(), DeviceError> {
+        let timeout_s = if pose.is_some() { self.timeouts.move_s } else { self.timeouts.job_s };
+        match self.robot().wait(ticket, timeout_s).await {
+            Ok(_) => Ok(()),
+            Err(late @ DeviceError::Timeout { .. }) => self.settle(late, pose).await,
+            Err(error) => Err(error),
+        }
+    }
+
+    /// After a time-out: reads the state until the arm rests, then says whether it is where it was to go. Sends nothing.
+    async fn settle(&self, lost: DeviceError, pose: Option<Transform<Base, Tool>>) -> Result<(), DeviceError> {
+        let limit_s = if pose.is_some() { self.timeouts.move_s } else { self.timeouts.job_s };
+        let polls = (limit_s / POLL_S).ceil() as usize;
+        for _ in 0..polls {
+            let state = self.robot().state().await?;
+            if let Some(state) = trouble(&state) {
+                return Err(DeviceError::NotReady {
+                    device: self.robot().name().into(),
+                    state,
+                });
+            }
+            if !state.running {
+                return if pose.is_none_or(|pose| is_at(&state, &pose)) { Ok(()) } else { Err(lost) };
+            }
+            self.clock.pass(POLL_S);
+            tokio::task::yield_now().await;
+        }
+        Err(lost)
+    }
+
+    /// Clears an alarm once, and believes it only if the state agrees. Moves nothing, and leaves alone what a person has
+    /// done: a hold, an emergency stop, another mode.
+    ///
+    /// # Errors
+    /// [`DeviceError::NotReady`] if the arm may not be moved: a person has to look.
+    pub async fn recover(&self) -> Result<(), DeviceError> {
+        let state = self.robot().state().await?;
+        if state.alarm.is_some() && !state.hold && !state.emergency_stop {
+            self.robot().reset().await?;
+        }
+        self.ready().await.map(|_| ())
+    }
+
+    /// Draws the bit straight back from where it stands to the front of a target, after a move that did not end.
+    ///
+    /// # Errors
+    /// What the arm says.
+    pub async fn withdraw(&self, target: &SafeTarget) -> Result<(), DeviceError> {
+        let speed_mm_s = self.approach.approach_mm_s;
+        self.to_standoff(target, Motion::Linear { speed_mm_s }).await
+    }
+}
+
+/// Why an arm may not be moved, if so.
+fn trouble(state: &ArmState) -> Option<String> {
+    if state.emergency_stop {
+        return Some("emergency stop".into());
+    }
+    if let Some((code, text)) = &state.alarm {
+        return Some(format!("alarm {code}: {text}"));
+    }
+    if state.hold {
+        return Some("held".into());
+    }
+    if state.mode != crate::device::ArmMode::Remote {
+        return Some(format!("mode {:?}, not remote", state.mode));
+    }
+    (!state.servo_on).then(|| "servo off".into())
+}
+
+fn is_at(state: &ArmState, pose: &Transform<Base, Tool>) -> bool {
+    let off = state.base_from_tool.isometry().inv_mul(pose.isometry());
+    off.translation.vector.norm() <= ARRIVED_MM && off.rotation.angle() <= ARRIVED_RAD
+}

@@ -1,0 +1,844 @@
+//! The way of one unit: load, read, then every step of the program: present, look, decide, act, look again; discharge.
+//!
+//! Every act is in the journal before it is begun, every answer before the next act. The state of a unit is the fold of its events
+//! ([`UnitRecord`]), so that going on after a crash and going on after a step are the same thing.
+
+use crate::capture::{FaceFit, Shot, present, region_around, regions_around, shoot};
+use crate::config::CellConfig;
+use crate::device::{DeviceError, Devices, DriveEnd, DriveProgram, TagValue, jobs, tags};
+use crate::journal::{Journal, JournalError};
+use crate::plan::{self, Reach, SafeTarget, Target};
+use crate::program::{FaceId, Program, Step, Work};
+use crate::record::{
+    Act, CoverRecord, Event, ExclusionReason, FaceRecord, LeftAlone, NgReason, Outcome, PictureId, PullEnd, Purpose,
+    ScrewAttempt, SeenBy, UnitRecord, Verdict,
+};
+use crate::removal::{Mover, Retry, retry_after};
+use calibration::Map;
+use geometry::{Pixel, RgbdFrame};
+use std::sync::Arc;
+
+/// A cover is off if its face lies this much deeper than before, mm.
+const COVER_OFF_MM: f64 = 15.0;
+
+/// Finds screws in a shot. [`vision::Detector`] does; tests have their own.
+pub trait Finder: Send + Sync {
+    /// Every candidate, in pixels of the shot, and in the camera's frame where it has depth.
+    fn find(&self, frame: &RgbdFrame) -> Vec<vision::Screw>;
+    /// What made it, for the record.
+    fn model(&self) -> String;
+}
+
+impl Finder for vision::Detector {
+    fn find(&self, frame: &RgbdFrame) -> Vec<vision::Screw> {
+        self.detect(frame, &vision::Options::default()).screws
+    }
+    fn model(&self) -> String {
+        vision::Detector::model(self).id().to_owned()
+    }
+}
+
+/// Is told how a unit gets on. Every method has an empty default.
+pub trait Observer {
+    /// A step begins: its number from 0, of how many, its name.
+    fn step(&self, _unit: u64, _step: usize, _of: usize, _name: &str) {}
+    /// A screw of the face is being worked on: its number from 0, of how many.
+    fn screw(&self, _screw: usize, _of: usize) {}
+    /// Something worth a line.
+    fn note(&self, _text: &str) {}
+    /// A unit has left the table.
+    fn finished(&self, _record: &UnitRecord) {}
+}
+
+/// An observer that does not care.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Silent;
+impl Observer for Silent {}
+
+/// Why the program could not go on. A unit that fails is no error: see [`Outcome`].
+#[derive(Debug, thiserror::Error)]
+pub enum RunError {
+    /// Devices, maps and program do not fit together.
+    #[error("the cell cannot run this program: {reason}")]
+    Setup {
+        /// What does not fit, and what to do.
+        reason: String,
+    },
+    /// No unit came, or it cannot be handed out.
+    #[error("{action}: {source}")]
+    Handling {
+        /// What was tried.
+        action: &'static str,
+        /// What the device said.
+        source: DeviceError,
+    },
+    /// The journal cannot be written: nothing is done that is not written down.
+    #[error(transparent)]
+    Journal(#[from] JournalError),
+}
+
+/// Why work on a unit ends.
+enum Stop {
+    Decided(Outcome),
+    Device(DeviceError),
+    Journal(JournalError),
+}
+impl From<DeviceError> for Stop {
+    fn from(error: DeviceError) -> Self {
+        Self::Device(error)
+    }
+}
+impl From<JournalError> for Stop {
+    fn from(error: JournalError) -> Self {
+        Self::Journal(error)
+    }
+}
+
+/// Takes units apart.
+pub struct Runner {
+    devices: Devices,
+    finder: Arc<dyn Finder>,
+    maps: Vec<Map>,
+    program: Program,
+    config: CellConfig,
+    journal: Journal,
+}
+
+impl std::fmt::Debug for Runner {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Runner").field("devices", &self.devices).finish_non_exhaustive()
+    }
+}
+
+impl Runner {
+    /// A runner of a program on a cell.
+    ///
+    /// # Arguments
+    /// * `maps` – one per arm, in the order of the arms; an arm without a map is never sent to a screw.
+    ///
+    /// # Errors
+    /// [`RunError::Setup`] if no arm can take screws out, or the program names an arm that is not there.
+    pub fn new(
+        devices: Devices,
+        finder: Arc<dyn Finder>,
+        maps: Vec<Map>,
+        program: Program,
+        config: CellConfig,
+        journal: Journal,
+    ) -> Result<Self, RunError> {
+        let able = devices.arms.iter().zip(&maps).any(|(arm, _)| arm.driver.is_some());
+        if !able {
+            return Err(RunError::Setup {
+                reason: "no arm has both a driver and a map; calibrate one first".into(),
+            });
+        }
+        let names: Vec<&str> = devices.arms.iter().map(|arm| arm.robot.name()).collect();
+        for step in &program.steps {
+            if let Work::Cover { by, .. } = &step.work
+                && !names.contains(&by.as_str())
+            {
+                return Err(RunError::Setup {
+                    reason: format!(
+                        "step '{}' is for arm '{by}', the cell has {}; change `by`",
+                        step.name,
+                        names.join(", ")
+                    ),
+                });
+            }
+        }
+        Ok(Self {
+            devices,
+            finder,
+            maps,
+            program,
+            config,
+            journal,
+        })
+    }
+
+    /// The journal.
+    pub fn journal(&self) -> &Journal {
+        &self.journal
+    }
+
+    /// Waits for the next unit and takes it apart.
+    ///
+    /// # Errors
+    /// [`RunError`]; a unit that fails is not one.
+    pub async fn run_unit(&mut self, observer: &dyn Observer) -> Result<UnitRecord, RunError> {
+        let since_s = self.devices.clock.now_s();
+        self.load().await.map_err(|source| RunError::Handling {
+            action: "waiting for a unit",
+            source,
+        })?;
+        let loaded_s = self.devices.clock.now_s();
+        let unit = self.journal.begin_unit(since_s)?;
+        let mut way = Way {
+            record: UnitRecord::new(unit, since_s),
+            runner: self,
+            observer,
+        };
+        // the time of waiting ends with the loading switch, whatever reading the plate takes
+        way.log_at(loaded_s, Event::Arrived)?;
+        let model = match way.runner.devices.reader.read().await {
+            Ok(model) => model.map(|m| m.0),
+            Err(error) => {
+                observer.note(&format!("the model number could not be read: {error}"));
+                None
+            }
+        };
+        way.log(Event::Identified { model })?;
+        way.finish().await
+    }
+
+    /// Goes on with the unit that was under way when the program ended; `None` if there was none.
+    ///
+    /// An act that was begun and whose end is not known is looked at: nothing is repeated or skipped on faith.
+    ///
+    /// # Errors
+    /// [`RunError`].
+    pub async fn resume_unit(&mut self, observer: &dyn Observer) -> Result<Option<UnitRecord>, RunError> {
+        let Some(unit) = self.journal.unfinished()? else {
+            return Ok(None);
+        };
+        let Some(record) = self.journal.unit(unit)? else {
+            return Ok(None);
+        };
+        let mut way = Way {
+            record,
+            runner: self,
+            observer,
+        };
+        way.log(Event::Resumed)?;
+        let loaded = way.runner.devices.io.read(tags::LOADED).await;
+        let loaded = loaded.map_err(|source| RunError::Handling {
+            action: "looking whether a unit stands on the table",
+            source,
+        })?;
+        if loaded != TagValue::Bool(true) {
+            if way.record.outcome.is_none() {
+                way.log(Event::Decided {
+                    outcome: Outcome::Ng {
+                        reason: NgReason::TakenAway,
+                        detail: "it was no longer on the table when the program came back".into(),
+                    },
+                })?;
+            }
+            way.log(Event::Discharged)?;
+            return way.close().await.map(Some);
+        }
+        way.finish().await.map(Some)
+    }
+
+    async fn load(&self) -> Result<(), DeviceError> {
+        let io = &self.devices.io;
+        let on = TagValue::Bool(true);
+        if io.read(tags::LOADED).await? != on {
+            match io.write(tags::FEED, on.clone()).await {
+                // the infeed may have heard: the switch tells
+                Ok(()) | Err(DeviceError::Timeout { .. }) => {}
+                Err(error) => return Err(error),
+            }
+            io.wait_for(tags::LOADED, on.clone(), self.config.timeouts.load_s).await?;
+        }
+        io.write(tags::MAGNET, on).await
+    }
+}
+
+/// One unit under way.
+struct Way<'a> {
+    runner: &'a mut Runner,
+    record: UnitRecord,
+    observer: &'a dyn Observer,
+}
+
+impl Way<'_> {
+    fn now_s(&self) -> f64 {
+        self.runner.devices.clock.now_s()
+    }
+
+    fn log(&mut self, event: Event) -> Result<(), JournalError> {
+        self.log_at(self.now_s(), event)
+    }
+
+    fn log_at(&mut self, t_s: f64, event: Event) -> Result<(), JournalError> {
+        self.runner.journal.append(self.record.unit, t_s, &event)?;
+        self.record.apply(t_s, &event);
+        Ok(())
+    }
+
+    fn mover(&self, arm: usize) -> Option<Mover<'_>> {
+        let runner = &self.runner;
+        Some(Mover {
+            arm: runner.devices.arms.get(arm)?,
+            approach: runner.config.approach,
+            timeouts: runner.config.timeouts,
+            clock: &runner.devices.clock,
+        })
+    }
+
+    /// Takes it apart, hands it out, closes its record.
+    async fn finish(mut self) -> Result<UnitRecord, RunError> {
+        if self.record.outcome.is_none() {
+            let outcome = match self.take_apart().await {
+                Ok(()) => Outcome::Ok,
+                Err(Stop::Decided(outcome)) => outcome,
+                Err(Stop::Device(error)) => Outcome::Ng {
+                    reason: NgReason::DeviceFault,
+                    detail: error.to_string(),
+                },
+                Err(Stop::Journal(error)) => return Err(error.into()),
+            };
+            self.observer.note(&outcome.to_string());
+            if self.record.recovering {
+                self.log(Event::Recovery { on: false })?;
+            }
+            self.log(Event::Decided { outcome })?;
+        }
+        if !self.record.discharged {
+            match self.discharge().await {
+                Ok(()) => self.log(Event::Discharged)?,
+                Err(Stop::Journal(error)) => return Err(error.into()),
+                Err(Stop::Device(source)) => {
+                    return Err(RunError::Handling {
+                        action: "handing the unit out; clear the table by hand, then go on with --resume",
+                        source,
+                    });
+                }
+                Err(Stop::Decided(_)) => {}
+            }
+        }
+        self.close().await
+    }
+
+    async fn close(self) -> Result<UnitRecord, RunError> {
+        self.runner.journal.finish_unit(&self.record)?;
+        // the plant's own systems may be down: the journal has everything
+        if let Ok(json) = serde_json::to_string(&self.record)
+            && let Err(error) = self.runner.devices.plant.report(&json).await
+        {
+            self.observer.note(&format!("the plant was not told of unit {}: {error}", self.record.unit));
+        }
+        self.observer.finished(&self.record);
+        Ok(self.record)
+    }
+
+    async fn take_apart(&mut self) -> Result<(), Stop> {
+        self.settle_open_act().await?;
+        let program = self.runner.program.clone();
+        if self.record.steps_done == 0 && self.record.attempts().next().is_none() {
+            for face in &program.survey {
+                let seen = self.record.faces.iter().any(|f| f.face == *face && f.purpose == Purpose::Survey);
+                if !seen {
+                    self.look_at(0, &program.steps[0], face, Purpose::Survey).await?;
+                }
+            }
+        }
+        for (index, step) in program.steps.iter().enumerate().skip(self.record.steps_done) {
+            self.observer.step(self.record.unit, index, program.steps.len(), &step.name);
+            if step.has_screws() {
+                self.screws(index, step, &step.present, Purpose::Work).await?;
+            }
+            if let Work::Cover { .. } = step.work {
+                self.cover(index, step).await?;
+            }
+            self.log(Event::StepDone { step: index })?;
+        }
+        Ok(())
+    }
+
+    /// What was begun when the program ended, and how it ended, is found out by looking. Drives and turns are answered by the
+    /// look that begins every step; a cover by the gripper or a picture.
+    async fn settle_open_act(&mut self) -> Result<(), Stop> {
+        if self.record.resumed == 0 {
+            return Ok(());
+        }
+        for arm in 0..self.runner.devices.arms.len() {
+            if let Some(mover) = self.mover(arm) {
+                mover.recover().await?;
+            }
+        }
+        self.home().await?;
+        let Some(Act::Pull { cover }) = self.record.open.clone() else {
+            return self.lay_aside().await;
+        };
+        let index = self.record.steps_done;
+        let program = self.runner.program.clone();
+        let Some(step) = program.steps.get(index) else { return Ok(()) };
+        let Work::Cover { takes_along, .. } = &step.work else { return Ok(()) };
+        let holding = self.runner.devices.io.read(tags::GRIPPER_HOLDING).await? == TagValue::Bool(true);
+        let (end, seen_by) = if holding {
+            (PullEnd::Off, SeenBy::Signal)
+        } else {
+            self.turn(&step.present).await?;
+            (self.is_cover_off(&step.present).await?, SeenBy::Picture)
+        };
+        self.lay_aside().await?;
+        self.log(Event::Pulled {
+            cover: CoverRecord {
+                step: index,
+                cover,
+                end,
+                seen_by,
+                takes_along: takes_along.clone(),
+                time_s: 0.0,
+            },
+        })?;
+        if end == PullEnd::Off {
+            self.log(Event::StepDone { step: index })?;
+        }
+        Ok(())
+    }
+
+    /// Whether the face that stands before the camera is still where it was when it was last looked at.
+    async fn is_cover_off(&mut self, face: &FaceId) -> Result<PullEnd, Stop> {
+        let config = self.runner.config.inspection;
+        let before = self.record.faces.iter().rev().find(|f| f.face == *face).and_then(|f| f.plane);
+        let shot = shoot(&self.runner.devices, None, config.depth_frames.max(1)).await?;
+        let now = FaceFit::of(&shot.frame, config.working_depth_mm).and_then(|fit| fit.plane());
+        Ok(match (before, now) {
+            (Some(before), Some(now)) if (now.depth_mm - before.depth_mm).abs() < COVER_OFF_MM => PullEnd::Stuck,
+            (Some(_), _) => PullEnd::Off,
+            // never measured before: pulling once more is bounded, leaving it on is not what was asked for
+            (None, _) => PullEnd::Stuck,
+        })
+    }
+
+    /// Sends the arms out of the way of table and camera.
+    async fn home(&self) -> Result<(), DeviceError> {
+        for arm in 0..self.runner.devices.arms.len() {
+            if let Some(mover) = self.mover(arm) {
+                mover.home().await?;
+            }
+        }
+        Ok(())
+    }
+
+    async fn turn(&mut self, face: &FaceId) -> Result<(), Stop> {
+        self.log(Event::Intent {
+            act: Act::Present { face: face.clone() },
+        })?;
+        present(&self.runner.devices, face, self.runner.config.timeouts.present_s).await?;
+        Ok(self.log(Event::Presented { face: face.clone() })?)
+    }
+
+    /// Presents a face, looks at it, and excludes the unit if the picture says so.
+    async fn look_at(
+        &mut self,
+        index: usize,
+        step: &Step,
+        face: &FaceId,
+        purpose: Purpose,
+    ) -> Result<(Shot, Vec<Target>), Stop> {
+        self.home().await?;
+        self.turn(face).await?;
+        let config = self.runner.config.clone();
+        let shot = shoot(&self.runner.devices, None, config.inspection.depth_frames).await?;
+        let screws = self.runner.finder.find(&shot.frame);
+        self.budget(&shot);
+        let fit = FaceFit::of(&shot.frame, config.inspection.working_depth_mm);
+        let (found, targets) = plan::plan(&screws, &shot, fit.as_ref(), &self.reaches(), &config);
+        let picture = self.runner.journal.store_picture(&shot.frame.color, config.journal.jpeg_quality)?;
+        let seen = FaceRecord {
+            step: index,
+            step_name: step.name.clone(),
+            face: face.clone(),
+            purpose,
+            t_s: shot.frame.t_s,
+            picture: Some(picture),
+            width_px: shot.frame.color.width(),
+            height_px: shot.frame.color.height(),
+            plane: fit.and_then(|fit| fit.plane()),
+            found,
+            attempts: Vec::new(),
+        };
+        // Excluded is what was out of scope before this face was touched. Once it has been, a failure is a failure.
+        let touched = self.record.faces.iter().any(|f| f.face == *face && !f.attempts.is_empty());
+        let least = if purpose == Purpose::Work { step.least_screws() } else { 0 };
+        let excluded = if touched || purpose == Purpose::Missed {
+            None
+        } else {
+            plan::exclusion(&seen, least, &config)
+        };
+        self.log(Event::Seen { face: Box::new(seen) })?;
+        match excluded {
+            Some((reason, detail)) => Err(self.exclude(reason, detail)),
+            None => Ok((shot, targets)),
+        }
+    }
+
+    fn exclude(&self, reason: ExclusionReason, detail: String) -> Stop {
+        Stop::Decided(Outcome::Excluded {
+            reason,
+            detail,
+            screws_out_before: self.record.screws_out(),
+        })
+    }
+
+    fn reaches(&self) -> Vec<Reach<'_>> {
+        let runner = &self.runner;
+        let arms = runner.devices.arms.iter().zip(&runner.maps).enumerate();
+        arms.filter(|(_, (arm, _))| arm.driver.is_some())
+            .map(|(arm, (_, map))| Reach { arm, map })
+            .collect()
+    }
+
+    /// Lets the time pass that computing on a picture is budgeted with.
+    fn budget(&self, shot: &Shot) {
+        let per_mpx = self.runner.config.inspection.vision_s_per_mpx;
+        self.runner.devices.clock.pass(per_mpx * shot.megapixels());
+    }
+
+    /// Takes the screws of a face out; returns how many came out.
+    async fn screws(&mut self, index: usize, step: &Step, face: &FaceId, purpose: Purpose) -> Result<usize, Stop> {
+        let (shot, targets) = self.look_at(index, step, face, purpose).await?;
+        let count = targets.len();
+        for (number, target) in targets.iter().enumerate() {
+            self.observer.screw(number, count);
+            self.remove(target, &shot).await?;
+        }
+        self.verify(&targets, &shot).await?;
+        self.home().await?;
+        Ok(self.record.faces.last().map_or(0, FaceRecord::removed))
+    }
+
+    /// One screw: a burst, and one more where the cause allows it.
+    async fn remove(&mut self, target: &Target, shot: &Shot) -> Result<(), Stop> {
+        let drive = self.runner.config.drive;
+        let end = self.burst(target.found, target.place, drive.first, None).await?;
+        let Some(retry) = retry_after(end, &drive) else {
+            return Ok(());
+        };
+        self.log(Event::Recovery { on: true })?;
+        self.retry(target, shot, retry).await?;
+        Ok(self.log(Event::Recovery { on: false })?)
+    }
+
+    async fn retry(&mut self, target: &Target, shot: &Shot, retry: Retry) -> Result<(), Stop> {
+        match retry {
+            Retry::Harder(program) => {
+                self.burst(target.found, target.place, program, None).await?;
+            }
+            Retry::LookAgain(program) => {
+                if let Some((place, picture)) = self.second_look(target, shot).await? {
+                    self.burst(target.found, place, program, Some(picture)).await?;
+                }
+            }
+        }
+        Ok(())
+    }
+
+    async fn burst(
+        &mut self,
+        found: usize,
+        place: SafeTarget,
+        program: DriveProgram,
+        second_look: Option<PictureId>,
+    ) -> Result<Option<DriveEnd>, Stop> {
+        let Some(arm) = self.runner.devices.arms.get(place.arm()).map(|arm| arm.robot.name().to_owned()) else {
+            return Ok(None);
+        };
+        let done = self.record.faces.last().and_then(|f| f.attempts.iter().find(|a| a.found == found));
+        self.log(Event::Intent {
+            act: Act::Drive {
+                found,
+                arm: arm.clone(),
+                aim: place.tip(),
+                burst: done.map_or(0, |a| a.bursts.len()),
+            },
+        })?;
+        let Some(mover) = self.mover(place.arm()) else {
+            return Ok(None);
+        };
+        let mut burst = mover.burst(&place, program).await;
+        burst.second_look = second_look;
+        let (end, error) = (burst.end, burst.error.clone());
+        self.log(Event::Driven { found, arm, burst })?;
+        if let Some(error) = error {
+            self.observer.note(&error);
+            // an arm that does not stand ready again is a matter for a person, not for the next screw
+            if let Some(mover) = self.mover(place.arm())
+                && mover.ready().await.is_err()
+            {
+                mover.recover().await?;
+                mover.withdraw(&place).await?;
+            }
+        }
+        Ok(end)
+    }
+
+    /// Looks at one screw again and maps it anew. `None` if no screw is seen there any more, or no arm may go there.
+    async fn second_look(&mut self, target: &Target, shot: &Shot) -> Result<Option<(SafeTarget, PictureId)>, Stop> {
+        self.home().await?;
+        let config = self.runner.config.clone();
+        let Some((center, half_px)) = self.place_in_picture(target.found, shot) else {
+            return Ok(None);
+        };
+        let camera = self.runner.devices.color.intrinsics();
+        let Some(region) = region_around(&camera, center, half_px) else {
+            return Ok(None);
+        };
+        let near = shoot(&self.runner.devices, Some(region), config.inspection.depth_frames.max(1)).await?;
+        let screws = self.runner.finder.find(&near.frame);
+        self.budget(&near);
+        let picture = self.runner.journal.store_picture(&near.frame.color, config.journal.jpeg_quality)?;
+        let same_px = config.inspection.same_screw_mm * half_px / config.inspection.second_look_mm;
+        let closest = screws
+            .into_iter()
+            .filter(|s| s.verdict == Verdict::Screw && near.to_whole(s.pixel).distance_px(&center) <= same_px)
+            .min_by(|a, b| {
+                let off = |s: &vision::Screw| near.to_whole(s.pixel).distance_px(&center);
+                off(a).total_cmp(&off(b))
+            });
+        self.log(Event::Verified {
+            screws: vec![(target.found, closest.is_some())],
+            pictures: vec![picture.clone()],
+        })?;
+        let Some(screw) = closest else { return Ok(None) };
+        // the region is too small for the plane of the face: the sheet around the screw has to do
+        let (_, again) = plan::plan(&[screw], &near, None, &self.reaches(), &config);
+        Ok(again.first().map(|t| (t.place, picture)))
+    }
+
+    /// Where a find is in the whole picture, and the half width of a region around it, px.
+    fn place_in_picture(&self, found: usize, shot: &Shot) -> Option<(Pixel, f64)> {
+        let find = self.record.faces.last()?.found.get(found)?;
+        let depth_mm = find.camera_mm?.z_mm();
+        let pixel_mm = shot.frame.camera?.pixel_mm(depth_mm);
+        let half_px = self.runner.config.inspection.second_look_mm / pixel_mm.max(1e-6);
+        Some((Pixel::new(find.u_px, find.v_px), half_px))
+    }
+
+    /// Looks again where a screw is said to have come out: in regions, since only these places can have changed, and a whole
+    /// picture of the same face under the same light would miss what the first one missed. One that still stands gets the
+    /// burst it has left.
+    async fn verify(&mut self, targets: &[Target], shot: &Shot) -> Result<(), Stop> {
+        let claimed = |a: &ScrewAttempt| {
+            a.still_there.is_none() && matches!(a.end(), Some(DriveEnd::Removed | DriveEnd::TimeOut))
+        };
+        let Some(standing) = self.look_where(claimed, shot).await? else {
+            return Ok(());
+        };
+        let mut again = false;
+        for found in standing {
+            let tried = self.record.faces.last().and_then(|f| f.attempts.iter().find(|a| a.found == found));
+            let retried = tried.is_some_and(|a| a.retries() > 0);
+            if let Some(target) = targets.iter().find(|t| t.found == found && !retried) {
+                self.log(Event::Recovery { on: true })?;
+                self.retry(target, shot, Retry::LookAgain(self.runner.config.drive.first)).await?;
+                again = true;
+            }
+        }
+        if again {
+            self.look_where(claimed, shot).await?;
+            self.log(Event::Recovery { on: false })?;
+        }
+        Ok(())
+    }
+
+    /// Takes pictures of the attempts that ask for it; returns those that still stand, `None` if there was nothing to look at.
+    async fn look_where(
+        &mut self,
+        asks: impl Fn(&ScrewAttempt) -> bool,
+        shot: &Shot,
+    ) -> Result<Option<Vec<usize>>, Stop> {
+        let Some(face) = self.record.faces.last() else { return Ok(None) };
+        let asked: Vec<usize> = face.attempts.iter().filter(|a| asks(a)).map(|a| a.found).collect();
+        let places: Vec<(usize, Pixel, f64)> = asked
+            .iter()
+            .filter_map(|found| self.place_in_picture(*found, shot).map(|(pixel, half_px)| (*found, pixel, half_px)))
+            .collect();
+        let Some(half_px) = places.iter().map(|p| p.2).reduce(f64::max) else {
+            return Ok(None);
+        };
+        self.home().await?;
+        let config = self.runner.config.clone();
+        let camera = self.runner.devices.color.intrinsics();
+        let pixels: Vec<Pixel> = places.iter().map(|p| p.1).collect();
+        let mut seen = Vec::new();
+        let mut pictures = Vec::new();
+        for region in regions_around(&camera, &pixels, half_px) {
+            let near = shoot(&self.runner.devices, Some(region), 0).await?;
+            let screws = self.runner.finder.find(&near.frame);
+            self.budget(&near);
+            pictures.push(self.runner.journal.store_picture(&near.frame.color, config.journal.jpeg_quality)?);
+            let standing = screws.iter().filter(|s| s.verdict == Verdict::Screw);
+            seen.extend(standing.map(|s| near.to_whole(s.pixel)));
+        }
+        let same = config.inspection.same_screw_mm / config.inspection.second_look_mm;
+        let screws: Vec<(usize, bool)> = places
+            .iter()
+            .map(|(found, pixel, half_px)| (*found, seen.iter().any(|s| s.distance_px(pixel) <= same * half_px)))
+            .collect();
+        let standing = screws.iter().filter(|s| s.1).map(|s| s.0).collect();
+        self.log(Event::Verified { screws, pictures })?;
+        Ok(Some(standing))
+    }
+
+    /// Pulls a cover; if it stays, looks for missed screws on the faces that hold it, once, and pulls again.
+    async fn cover(&mut self, index: usize, step: &Step) -> Result<(), Stop> {
+        let Work::Cover { cover, held_by, .. } = &step.work else {
+            return Ok(());
+        };
+        if self.pull(index, step).await? == PullEnd::Off {
+            return Ok(());
+        }
+        // A screw that is known to stand holds the cover: looking for others would not free it.
+        if let Some(known) = self.known_standing(held_by) {
+            return Err(Stop::Decided(known));
+        }
+        self.observer.note(&format!("the {cover} cover does not come off: looking for missed screws"));
+        self.log(Event::Recovery { on: true })?;
+        let mut pulled_again = false;
+        for face in held_by {
+            if !self.record.faces.iter().any(|f| f.face == *face) {
+                continue; // this product has no screws there, or the face cannot be presented yet
+            }
+            if self.screws(index, step, face, Purpose::Missed).await? > 0 {
+                pulled_again = true;
+                if self.pull(index, step).await? == PullEnd::Off {
+                    return Ok(self.log(Event::Recovery { on: false })?);
+                }
+            }
+        }
+        // the grip may have slipped: a bounded pull may be tried a second time
+        if !pulled_again && self.pull(index, step).await? == PullEnd::Off {
+            return Ok(self.log(Event::Recovery { on: false })?);
+        }
+        Err(Stop::Decided(self.known_standing(held_by).unwrap_or_else(|| Outcome::Ng {
+            reason: NgReason::CoverStuck,
+            detail: format!("the {cover} cover did not come off, and no screw that holds it was seen"),
+        })))
+    }
+
+    /// A screw on these faces that is known to stand, as the reason of a failure.
+    fn known_standing(&self, faces: &[FaceId]) -> Option<Outcome> {
+        for face in faces {
+            let Some(last) = self.record.faces.iter().rev().find(|f| f.face == *face) else {
+                continue;
+            };
+            let failed = last.attempts.iter().filter(|a| !a.removed() && a.still_there != Some(false));
+            for attempt in failed {
+                let (reason, what) = match attempt.end() {
+                    Some(DriveEnd::Seized) => (NgReason::ScrewSeized, "did not turn"),
+                    Some(DriveEnd::CamOut) => (NgReason::ScrewCamOut, "let the bit slip"),
+                    Some(DriveEnd::MissedHead | DriveEnd::Removed) => (NgReason::ScrewMissed, "was not met by the bit"),
+                    Some(DriveEnd::TimeOut) | None => (NgReason::DeviceFault, "could not be worked on"),
+                };
+                return Some(Outcome::Ng {
+                    reason,
+                    detail: format!(
+                        "{face}: a screw {what} in {} burst(s), its cover stays",
+                        attempt.bursts.len()
+                    ),
+                });
+            }
+            let barred = [
+                LeftAlone::HullEdge,
+                LeftAlone::HullOutside,
+                LeftAlone::NoDepth,
+                LeftAlone::Bent,
+            ];
+            let screw = last
+                .found
+                .iter()
+                .find(|f| f.verdict == Verdict::Screw && f.left_alone.is_some_and(|why| barred.contains(&why)));
+            if let Some(why) = screw.and_then(|f| f.left_alone) {
+                return Some(Outcome::Ng {
+                    reason: NgReason::ScrewOutOfReach,
+                    detail: format!("{face}: a screw was left alone ({why}), its cover stays"),
+                });
+            }
+        }
+        None
+    }
+
+    /// One bounded pull at a cover; lays it aside if it comes off.
+    async fn pull(&mut self, index: usize, step: &Step) -> Result<PullEnd, Stop> {
+        let Work::Cover {
+            cover, by, takes_along, ..
+        } = &step.work
+        else {
+            return Ok(PullEnd::Stuck);
+        };
+        self.home().await?;
+        self.lay_aside().await?;
+        self.turn(&step.present).await?;
+        let begin_s = self.now_s();
+        self.log(Event::Intent {
+            act: Act::Pull { cover: cover.clone() },
+        })?;
+        let arm = self.runner.devices.arms.iter().position(|arm| arm.robot.name() == by);
+        if let Some(mover) = arm.and_then(|arm| self.mover(arm)) {
+            mover.ready().await?;
+            mover.job(&jobs::pull(cover)).await?;
+        }
+        let holding = self.runner.devices.io.read(tags::GRIPPER_HOLDING).await? == TagValue::Bool(true);
+        let end = if holding { PullEnd::Off } else { PullEnd::Stuck };
+        self.log(Event::Pulled {
+            cover: CoverRecord {
+                step: index,
+                cover: cover.clone(),
+                end,
+                seen_by: SeenBy::Signal,
+                takes_along: takes_along.clone(),
+                time_s: self.now_s() - begin_s,
+            },
+        })?;
+        if holding {
+            self.lay_aside().await?;
+        }
+        Ok(end)
+    }
+
+    /// Lays the cover aside that the gripper holds, if it holds one.
+    async fn lay_aside(&mut self) -> Result<(), Stop> {
+        let io = &self.runner.devices.io;
+        if io.read(tags::GRIPPER_HOLDING).await? != TagValue::Bool(true) {
+            return Ok(());
+        }
+        let pullers = self.runner.program.steps.iter().filter_map(|step| match &step.work {
+            Work::Cover { by, .. } => Some(by),
+            Work::Screws { .. } => None,
+        });
+        let arms = &self.runner.devices.arms;
+        let arm = pullers.filter_map(|by| arms.iter().position(|arm| arm.robot.name() == by)).next();
+        if let Some(mover) = arm.and_then(|arm| self.mover(arm)) {
+            mover.job(jobs::DROP).await?;
+        }
+        Ok(self.log(Event::LaidAside)?)
+    }
+
+    async fn discharge(&mut self) -> Result<(), Stop> {
+        for arm in 0..self.runner.devices.arms.len() {
+            if let Some(mover) = self.mover(arm) {
+                mover.recover().await?;
+            }
+        }
+        self.home().await?;
+        self.lay_aside().await?;
+        let loaded = TagValue::Bool(true);
+        // asked before it is ordered: after a crash the unit may have left already
+        if self.runner.devices.io.read(tags::LOADED).await? != loaded {
+            return Ok(());
+        }
+        self.log(Event::Intent { act: Act::Discharge })?;
+        let io = &self.runner.devices.io;
+        io.write(tags::MAGNET, TagValue::Bool(false)).await?;
+        match io.write(tags::DISCHARGE, TagValue::Bool(true)).await {
+            Ok(()) | Err(DeviceError::Timeout { .. }) => {}
+            Err(error) => return Err(error.into()),
+        }
+        let gone = TagValue::Bool(false);
+        match io.wait_for(tags::LOADED, gone.clone(), self.runner.config.timeouts.discharge_s).await {
+            Err(late @ DeviceError::Timeout { .. }) => {
+                if io.read(tags::LOADED).await? == gone {
+                    Ok(())
+                } else {
+                    Err(late.into())
+                }
+            }
+            other => Ok(other?),
+        }
+    }
+}
