@@ -71,6 +71,10 @@ fn grey(value: f32) -> [f32; 3] {
     [value; 3]
 }
 
+fn scaled(albedo: [f32; 3], by: f32) -> [f32; 3] {
+    albedo.map(|v| v * by)
+}
+
 fn matt(albedo: [f32; 3], roughness: f32) -> Material {
     Material {
         albedo,
@@ -127,30 +131,40 @@ pub(crate) fn plating(kind: Plating, sheet: &SheetFinish, rng: &mut Pcg64Mcg) ->
     }
 }
 
-/// Seat pressed into the sheet around an item: flat, raised boss, dish or bead.
-fn seat(radius: f32, rng: &mut Pcg64Mcg) -> impl Fn(f32) -> f32 + 'static {
-    let shape = rng.random_range(0..10);
-    let (height, inner, outer) = match shape {
-        0..=4 => (0.0, 1.0, 2.0),
-        5 | 6 => (between(rng, 0.4, 1.4), between(rng, 1.2, 1.6), 0.0),
-        7 | 8 => (-between(rng, 0.3, 1.2), between(rng, 1.15, 1.55), 0.0),
-        _ => (between(rng, 0.15, 0.5), between(rng, 1.35, 1.7), -1.0),
-    };
-    let width = between(rng, 0.12, 0.4);
-    let bead = outer < 0.0;
-    move |r: f32| {
-        if height == 0.0 {
-            return 0.0;
-        }
-        let rho = r / radius;
-        if bead {
-            let t = (rho - inner) / (0.6 * width);
-            height * (-t * t).exp()
-        } else {
-            // A plateau under the item: its foot is its own zero.
-            height * (1.0 - smoothstep(inner, inner + width, rho))
+/// Form pressed into the sheet under an item.
+#[derive(Clone, Copy)]
+enum Seat {
+    Flat,
+    /// Plateau (or, negative, dish): height, inner and outer radius of its flank.
+    Step(f32, f32, f32),
+    /// Ring around the item: height, radius, width.
+    Bead(f32, f32, f32),
+}
+
+impl Seat {
+    fn at(self, r: f32) -> f32 {
+        match self {
+            Seat::Flat => 0.0,
+            Seat::Step(height, inner, outer) => height * (1.0 - smoothstep(inner, outer, r)),
+            Seat::Bead(height, ring, width) => {
+                let t = (r - ring) / width;
+                height * (-t * t).exp()
+            }
         }
     }
+}
+
+/// Most items sit on plain sheet, some on a boss, in a dish or inside a bead.
+fn seat(radius: f32, rng: &mut Pcg64Mcg) -> impl Fn(f32) -> f32 + 'static {
+    let inner = radius * between(rng, 1.1, 1.6);
+    let flank = radius * between(rng, 0.15, 0.5);
+    let seat = match rng.random_range(0..10) {
+        0 => Seat::Step(between(rng, 0.3, 1.2), inner, inner + flank),
+        1 => Seat::Step(-between(rng, 0.2, 1.0), inner, inner + flank),
+        2 => Seat::Bead(between(rng, 0.1, 0.4), inner + 0.2 * radius, 0.5 * flank),
+        _ => Seat::Flat,
+    };
+    move |r| seat.at(r)
 }
 
 /// Cross recess: depth below the rim over its own axes.
@@ -179,7 +193,7 @@ impl Cross {
             } else {
                 between(rng, 0.19, 0.3)
             };
-        let depth = (half * between(rng, 0.75, 1.15)).min(head_height * 0.85 + 0.5).max(0.7);
+        let depth = (half * between(rng, 0.85, 1.25)).min(head_height * 0.85 + 0.5).max(0.7);
         let slot = (kind == CrossRecess::Combination).then(|| {
             [
                 head_radius * between(rng, 0.72, 1.05),
@@ -239,7 +253,7 @@ impl Cross {
             let edge = inside / 0.22;
             burr = (self.worn * 1.6).min(1.0) * (-edge * edge).exp() * smoothstep(-0.1, 0.35, rough);
         }
-        let floor = ((self.half - r) * self.floor + 0.35).clamp(0.1, self.depth) + (0.5 * (self.core - r)).max(0.0);
+        let floor = ((self.half - r) * self.floor + 0.55).clamp(0.1, self.depth) + (0.5 * (self.core - r)).max(0.0);
         let mut depth = (-inside * self.side).min(floor).max(0.0);
         if let Some([length, half_width, slot_depth]) = self.slot {
             let flank = ((half_width - b) * 6.0).min((length - a) * 4.0);
@@ -299,7 +313,7 @@ fn marks(radius: f32, rng: &mut Pcg64Mcg) -> impl Fn(f32, f32) -> f32 + 'static 
     let wave = Noise::new(Grain::Cloud, radius * between(rng, 0.5, 1.2), rng);
     let depth = between(rng, 0.01, 0.07);
     let grain = Noise::new(Grain::Even, 0.25, rng);
-    let grain_depth = between(rng, 0.0, 0.012);
+    let grain_depth = between(rng, 0.0, 0.02);
     move |u, v| {
         let r = (u * u + v * v).sqrt() / (0.13 * radius.max(1.0) / 3.0);
         turned * rings[r as usize % 64] + depth * (wave.at(u, v) - 0.5) + grain_depth * (grain.at(u, v) - 0.5)
@@ -342,7 +356,8 @@ fn screw(item: &Item, head: Head, recess: CrossRecess, width: f32, sheet: &Sheet
     let top = shape.top(0.0, 0.0).map_or(1.0, |s| s.0);
     let base = foot(0.0);
     let swell = between(rng, 0.0, 0.05);
-    let rim_mm = base + shape.top(ox, oy).map_or(top, |s| s.0);
+    // The rim of the recess lies where the wings end, a little below a dome's top.
+    let rim_mm = base + shape.top(ox + 0.35 * width, oy).map_or(top, |s| s.0);
     let washer = if rng.random_bool(0.7) {
         main
     } else {
@@ -390,12 +405,12 @@ impl HeadShape {
     fn top(&self, u: f32, v: f32) -> Option<(f32, u8)> {
         let r = (u * u + v * v).sqrt();
         let mut top = None;
-        if let Some([radius, thickness, slope]) = self.washer {
-            if r < radius {
-                let edge = ((radius - r) / 0.3).min(1.0);
-                let rise = slope * (1.0 - r / radius).max(0.0);
-                top = Some((thickness * (0.4 + 0.6 * edge) + rise, 1));
-            }
+        if let Some([radius, thickness, slope]) = self.washer
+            && r < radius
+        {
+            let edge = ((radius - r) / 0.3).min(1.0);
+            let rise = slope * (1.0 - r / radius).max(0.0);
+            top = Some((thickness * (0.4 + 0.6 * edge) + rise, 1));
         }
         let above = top.map_or(0.0, |t| t.0);
         let head = if let Some([flat, height, chamfer, dish]) = self.hex {
@@ -624,7 +639,7 @@ fn empty_hole(item: &Item, sheet: &SheetFinish, rng: &mut Pcg64Mcg) -> Form {
             metallic: sheet.metallic,
         },
     };
-    let ring = matt([0.09, 0.07, 0.055].map(|v| v * between(rng, 0.5, 2.5)), 0.8);
+    let ring = matt(scaled([0.09, 0.07, 0.055], between(rng, 0.5, 2.5)), 0.8);
     let ring_width = between(rng, 0.0, 0.5);
     let ragged = Noise::new(Grain::Cloud, 2.0, rng);
     let extruded = if rng.random_bool(0.5) {
@@ -793,21 +808,21 @@ fn hexagonal(item: &Item, decoy: Decoy, sheet: &SheetFinish, rng: &mut Pcg64Mcg)
                 under = flange_height * (0.4 + 0.6 * edge) + cone * (1.0 - r / radius);
                 spot = Spot::body(base + under, 1);
             }
-            if let Some(top) = hex_top(u, v, flat, height, chamfer) {
-                if top > under {
-                    spot = Spot::body(base + top + relief(u, v), 0);
-                    if !nut {
-                        if dish > 0.0 {
-                            spot.height -= dish * (1.0 - smoothstep(dish_radius - 0.08, dish_radius + 0.05, r / flat));
-                        }
-                        if stamp > 0 {
-                            for s in &strokes {
-                                spot.height += raised * (1.0 - smoothstep(0.12, 0.28, segment(u, v, *s)));
-                            }
-                        }
-                    } else if nylon && r < flat * 0.82 && r > bore {
-                        spot = Spot::body(base + top + 0.3, 3);
+            if let Some(top) = hex_top(u, v, flat, height, chamfer)
+                && top > under
+            {
+                spot = Spot::body(base + top + relief(u, v), 0);
+                if !nut {
+                    if dish > 0.0 {
+                        spot.height -= dish * (1.0 - smoothstep(dish_radius - 0.08, dish_radius + 0.05, r / flat));
                     }
+                    if stamp > 0 {
+                        for s in &strokes {
+                            spot.height += raised * (1.0 - smoothstep(0.12, 0.28, segment(u, v, *s)));
+                        }
+                    }
+                } else if nylon && r < flat * 0.82 && r > bore {
+                    spot = Spot::body(base + top + 0.3, 3);
                 }
             }
             if nut && r < bore {
@@ -1217,11 +1232,11 @@ fn weld(item: &Item, sheet: &SheetFinish, rng: &mut Pcg64Mcg) -> Form {
     let height = radius * between(rng, 0.25, 0.5);
     let burnt = if sheet.metallic > 0.5 || rng.random_bool(0.6) {
         metal(
-            [0.4, 0.38, 0.37].map(|v| v * between(rng, 0.5, 1.5)),
+            scaled([0.4, 0.38, 0.37], between(rng, 0.5, 1.5)),
             between(rng, 0.3, 0.6),
         )
     } else {
-        matt(sheet.albedo.map(|v| v * between(rng, 0.5, 0.9)), 0.6)
+        matt(scaled(sheet.albedo, between(rng, 0.5, 0.9)), 0.6)
     };
     let blue = metal([0.3, 0.28, 0.33], 0.5);
     let ripple = between(rng, 0.0, 0.12);

@@ -238,3 +238,81 @@ impl Relief {
         lit * lit * (3.0 - 2.0 * lit)
     }
 }
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use super::*;
+
+    /// A block 2 mm high and 4 mm wide on a sheet of 16 mm.
+    fn block() -> Relief {
+        let (size, texel_mm) = (161, 0.1_f32);
+        let inside = |i: usize| {
+            let (x, y) = (i % size, i / size);
+            x.abs_diff(80) <= 20 && y.abs_diff(80) <= 20
+        };
+        let cells = size * size;
+        Relief {
+            size,
+            texel_mm,
+            height_mm: (0..cells).map(|i| if inside(i) { 2.0 } else { 0.0 }).collect(),
+            material: vec![
+                Material {
+                    albedo: [0.5; 3],
+                    roughness: 0.5,
+                    metallic: 0.0
+                };
+                cells
+            ],
+            cover: (0..cells).map(|i| if inside(i) { 1.0 } else { 0.0 }).collect(),
+            solid: (0..cells).map(inside).collect(),
+            open: vec![1.0; cells],
+            top_mm: 2.0,
+            bottom_mm: 0.0,
+            rim_height_mm: 2.0,
+            rim_center_mm: [0.0, 0.0, 2.0],
+            axis: [0.0, 0.0, 1.0],
+            slot_fill: 0.0,
+            head_cover: 0.0,
+            slot_visible: 1.0,
+        }
+    }
+
+    #[test]
+    fn a_ray_meets_top_side_and_sheet_where_geometry_says() {
+        let relief = block();
+        let top = relief.march([1.0, 0.5, 0.0], [0.0, 0.0, -1.0]).unwrap();
+        assert!((top[2] - 2.0).abs() < 1e-3 && (top[0] - 1.0).abs() < 1e-3);
+        // Slanted by 45 degrees toward -x, aimed at x = 1 in the sheet: it hits the side (x = 2) at height 1.
+        let side = relief.march([1.0, 0.0, 0.0], [-1.0, 0.0, -1.0]).unwrap();
+        assert!(
+            (side[0] - 2.05).abs() < 0.12 && (side[2] - 1.0).abs() < 0.15,
+            "{side:?}"
+        );
+        let sheet = relief.march([5.0, 0.0, 0.0], [-0.3, 0.0, -1.0]).unwrap();
+        assert!((sheet[0] - 5.0).abs() < 0.02 && sheet[2].abs() < 1e-3);
+        assert!(relief.march([9.0, 0.0, 0.0], [0.0, 0.0, -1.0]).is_none());
+    }
+
+    #[test]
+    fn the_shadow_ends_where_the_light_clears_the_edge() {
+        let relief = block();
+        let toward = [-std::f32::consts::FRAC_1_SQRT_2, 0.0, std::f32::consts::FRAC_1_SQRT_2];
+        // Behind the block (+x) a light at 45 degrees leaves 2 mm of shadow.
+        assert!(relief.visibility([3.0, 0.0, 0.0], toward, 0.01) < 0.05);
+        assert!(relief.visibility([4.7, 0.0, 0.0], toward, 0.01) > 0.9);
+        assert!(relief.visibility([-3.0, 0.0, 0.0], toward, 0.01) > 0.99);
+        let edge = relief.visibility([4.05, 0.0, 0.0], toward, 0.3);
+        assert!((0.1..0.9).contains(&edge), "a wide light has a half-shadow: {edge}");
+    }
+
+    #[test]
+    fn the_edge_of_an_item_keeps_its_own_colour() {
+        let mut relief = block();
+        for (m, c) in relief.material.iter_mut().zip(&relief.cover) {
+            m.albedo = if *c > 0.5 { [0.8, 0.1, 0.1] } else { [0.0, 0.9, 0.0] };
+        }
+        let (material, cover) = relief.material(2.04, 0.0);
+        assert!(cover > 0.2 && cover < 0.8 && material.albedo[1] < 0.11);
+    }
+}

@@ -202,7 +202,11 @@ impl Lighting {
             mix(body, [1.0; 3], rng.random_range(0.55..0.98))
         };
         // Share of the light that comes from the surroundings: 0.15 is harsh, 0.85 shadowless.
-        let ambient = rng.random_range(0.15..0.8_f32);
+        let ambient = if rng.random_bool(0.6) {
+            rng.random_range(0.12..0.4_f32)
+        } else {
+            rng.random_range(0.4..0.8_f32)
+        };
         let count = if rng.random_bool(0.35) {
             1
         } else {
@@ -211,14 +215,9 @@ impl Lighting {
         let mut lights = Vec::with_capacity(count);
         for i in 0..count {
             let azimuth = rng.random_range(0.0..TAU);
-            let elevation = rng.random_range(0.5..1.45_f32);
+            let elevation = rng.random_range(0.42..1.35_f32);
             let toward = direction(azimuth, elevation);
-            let hard = rng.random_bool(0.35);
-            let softness = if hard {
-                rng.random_range(0.01..0.07)
-            } else {
-                rng.random_range(0.07..0.5_f32)
-            };
+            let softness = (0.012_f32.ln() + rng.random::<f32>() * (0.45_f32 / 0.012).ln()).exp();
             let power = if i == 0 { 1.0 } else { rng.random_range(0.1..0.9_f32) };
             let tint = colour(rng);
             let emitter = if rng.random_bool(0.45) {
@@ -238,13 +237,13 @@ impl Lighting {
         let level = rng.random_range(0.35..1.0_f32);
         let dark_tint = colour(rng);
         let bright_tint = colour(rng);
-        let dark = rng.random_range(0.05..0.9_f32) * level;
+        let dark = rng.random_range(0.03..0.8_f32) * level;
         let mut lobes = Vec::new();
-        for _ in 0..rng.random_range(2..=5) {
+        for _ in 0..rng.random_range(2..=6) {
             let azimuth = rng.random_range(0.0..TAU);
             let elevation = rng.random_range(0.15..1.5_f32);
             let sharpness = rng.random_range(1.0..4.5_f32).exp();
-            let power = rng.random_range(0.3..3.0_f32) * if sharpness > 25.0 { 1.8 } else { 1.0 };
+            let power = rng.random_range(0.3..2.5_f32) * if sharpness > 20.0 { 3.0 } else { 1.0 };
             let tint = colour(rng);
             lobes.push(Lobe {
                 toward: direction(azimuth, elevation),
@@ -266,6 +265,20 @@ impl Lighting {
         };
         lighting.balance(ambient);
         lighting
+    }
+
+    /// Even light from all sides, no shadows: for tests and for comparing materials.
+    pub fn overcast() -> Lighting {
+        Lighting {
+            lights: Vec::new(),
+            environment: Environment {
+                up: [0.0, 0.0, 1.0],
+                dark: [1.0; 3],
+                bright: [1.0; 3],
+                lobes: Vec::new(),
+                bounce: [0.5; 3],
+            },
+        }
     }
 
     /// Scales lights and surroundings so that a white matt sheet has radiance 1, `ambient` of it from the surroundings.
@@ -358,5 +371,72 @@ impl Lighting {
             }
         }
         out
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rand::SeedableRng;
+    use rand_pcg::Pcg64Mcg;
+
+    const UP: Vec3 = [0.0, 0.0, 1.0];
+
+    fn material(albedo: f32, roughness: f32, metallic: f32) -> Material {
+        Material {
+            albedo: [albedo; 3],
+            roughness,
+            metallic,
+        }
+    }
+
+    #[test]
+    fn a_white_sheet_has_radiance_about_one() {
+        for seed in 0..200 {
+            let lighting = Lighting::sample(&mut Pcg64Mcg::seed_from_u64(seed));
+            let white = lighting.radiance(&material(1.0, 1.0, 0.0), UP, UP, &[], 1.0, [0.0; 3]);
+            let luminance = 0.2126 * white[0] + 0.7152 * white[1] + 0.0722 * white[2];
+            assert!((0.8..1.4).contains(&luminance), "seed {seed}: {white:?}");
+        }
+    }
+
+    #[test]
+    fn nothing_sends_back_more_than_it_gets() {
+        // Under even light every surface is at most as bright as the light.
+        let flat = Lighting::overcast();
+        for roughness in [0.1, 0.3, 0.6, 1.0] {
+            for slant in [0.0_f32, 0.5, 1.0] {
+                let view = [slant.sin(), 0.0, slant.cos()];
+                for metallic in [0.0, 1.0] {
+                    let out = flat.radiance(&material(1.0, roughness, metallic), UP, view, &[], 1.0, [0.0; 3])[0];
+                    assert!((0.55..1.12).contains(&out), "{roughness} {slant} {metallic}: {out}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn a_shadow_and_a_hollow_darken() {
+        let lighting = Lighting::sample(&mut Pcg64Mcg::seed_from_u64(7));
+        let zinc = material(0.7, 0.4, 1.0);
+        let lit = lighting.radiance(&zinc, UP, UP, &[], 1.0, [0.0; 3]);
+        let shadow = lighting.radiance(&zinc, UP, UP, &[0.0; 8], 1.0, [0.0; 3]);
+        let hollow = lighting.radiance(&zinc, UP, UP, &[0.0; 8], 0.3, [0.0; 3]);
+        assert!(lit[1] > shadow[1] && shadow[1] > hollow[1]);
+    }
+
+    #[test]
+    fn a_near_lamp_fades_with_distance() {
+        let lamp = Light {
+            emitter: Emitter::Near {
+                position_mm: [-500.0, 0.0, 1000.0],
+            },
+            strength: [1.0; 3],
+            softness: 0.05,
+        };
+        let near = lamp.at([-400.0, 0.0, 0.0]);
+        let far = lamp.at([400.0, 0.0, 0.0]);
+        assert!(near.strength[0] > far.strength[0]);
+        assert!((lamp.at([0.0; 3]).strength[0] - 1.0).abs() < 1e-5);
     }
 }

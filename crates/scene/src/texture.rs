@@ -94,10 +94,10 @@ impl Texture {
         let x = self.turn[0] * x_mm - self.turn[1] * y_mm + self.shift[0];
         let y = self.turn[1] * x_mm + self.turn[0] * y_mm + self.shift[1];
         // Mirrored repeat: photographs do not tile.
+        let side = self.tile.side as i32;
         let fold = |v: f32| {
-            let period = 2 * self.tile.side as i32;
-            let i = (v.floor() as i32).rem_euclid(period);
-            (if i < self.tile.side as i32 { i } else { period - 1 - i }) as usize
+            let i = (v as i32).rem_euclid(2 * side);
+            i.min(2 * side - 1 - i) as usize
         };
         self.tile.texels[fold(y) * self.tile.side + fold(x)]
     }

@@ -21,6 +21,10 @@ fn mix(a: [f32; 3], b: [f32; 3], t: f32) -> [f32; 3] {
     ]
 }
 
+fn scaled(albedo: [f32; 3], by: f32) -> [f32; 3] {
+    albedo.map(|v| (v * by).min(0.95))
+}
+
 fn matt(albedo: [f32; 3], roughness: f32) -> Material {
     Material {
         albedo,
@@ -73,7 +77,7 @@ pub(crate) fn reshape(canvas: &mut Canvas, item: &Item, form: &Form, rng: &mut P
         let pits = Noise::new(Grain::Even, 0.5, rng);
         let amount = (wear.rust.max(0.8 * wear.white_rust) * form.corrodes).min(1.0);
         let depth = between(rng, 0.08, 0.3) * amount;
-        let grain = between(rng, 0.03, 0.1) * amount;
+        let grain = between(rng, 0.04, 0.2) * amount;
         let clog = amount * between(rng, 0.0, 0.35);
         canvas.each(|x, y, t| {
             if t.part == u8::MAX {
@@ -190,7 +194,6 @@ fn mud(canvas: &mut Canvas, item: &Item, rng: &mut Pcg64Mcg) {
             t.lump = t
                 .lump
                 .max(smoothstep(0.02, 0.25, fill) * smoothstep(0.5, 0.9, t.filled / t.recess));
-            t.hidden = t.hidden.max(0.0);
         }
         let r = ((x - cx).powi(2) + (y - cy).powi(2)).sqrt() / half;
         let cake = smoothstep(0.0, 0.5, spill * 1.6 - r * 0.7 + 1.1 * (uneven - 0.5));
@@ -228,7 +231,7 @@ pub(crate) fn colour(canvas: &mut Canvas, item: &Item, sheet: &SheetFinish, form
             2 => [0.24, 0.18, 0.12],
             _ => [0.12, 0.085, 0.055],
         };
-        let base = base.map(|v| v * between(rng, 0.7, 1.4));
+        let base = scaled(base, between(rng, 0.7, 1.4));
         let rough = between(rng, 0.5, 0.95);
         let grain = Noise::new(Grain::Even, 0.5, rng);
         canvas.each(|x, y, t| {
@@ -260,6 +263,7 @@ fn finish(canvas: &mut Canvas, item: &Item, rng: &mut Pcg64Mcg) {
         _ => [1.0; 3],
     };
     let turn = between(rng, 0.0, 1.0);
+    let sunk = between(rng, 0.05, 0.5);
     canvas.each(|x, y, t| {
         if t.part == u8::MAX {
             return;
@@ -273,6 +277,14 @@ fn finish(canvas: &mut Canvas, item: &Item, rng: &mut Pcg64Mcg) {
             *a = (*a * shade * c).clamp(0.003, 0.97);
         }
         m.roughness = (m.roughness + rough * (smear.at(y, x) - 0.35)).clamp(0.08, 1.0);
+        if t.recess > 0.0 {
+            // The punch leaves its own scale, and oil keeps the dirt of years.
+            let depth = smoothstep(0.1, 0.8, t.recess) * sunk;
+            m.roughness = (m.roughness + 0.5 * depth).min(0.9);
+            for a in &mut m.albedo {
+                *a *= 1.0 - depth;
+            }
+        }
         if t.burr > 0.0 && m.metallic > 0.5 {
             m.roughness = (m.roughness - 0.1 * t.burr).max(0.08);
         }
@@ -285,7 +297,7 @@ fn chip(canvas: &mut Canvas, item: &Item, form: &Form, rng: &mut Pcg64Mcg) {
     let fine = Noise::new(Grain::Vein, 0.8, rng);
     let coated = matches!(item.plating, Plating::Painted | Plating::BlackOxide);
     let steel = Material {
-        albedo: [0.52, 0.5, 0.48].map(|v| v * between(rng, 0.6, 1.3)),
+        albedo: scaled([0.52, 0.5, 0.48], between(rng, 0.6, 1.3)),
         roughness: between(rng, 0.25, 0.5),
         metallic: 1.0,
     };
@@ -294,7 +306,7 @@ fn chip(canvas: &mut Canvas, item: &Item, form: &Form, rng: &mut Pcg64Mcg) {
     } else {
         // Bared iron under zinc is darker.
         Material {
-            albedo: [0.3, 0.28, 0.27].map(|v| v * between(rng, 0.6, 1.3)),
+            albedo: scaled([0.3, 0.28, 0.27], between(rng, 0.6, 1.3)),
             roughness: 0.55,
             metallic: 0.9,
         }
@@ -304,7 +316,7 @@ fn chip(canvas: &mut Canvas, item: &Item, form: &Form, rng: &mut Pcg64Mcg) {
         if t.part == u8::MAX {
             return;
         }
-        let edge = (1.0 - t.open) * 0.0 + if t.recess > 0.0 { 0.1 } else { 0.0 };
+        let edge = if t.recess > 0.0 { 0.1 } else { 0.0 };
         let value = 0.75 * flakes.at(x, y) + 0.25 * fine.at(x, y) + edge;
         let gone = if level > NOTHING {
             smoothstep(threshold - 0.02, threshold + 0.02, value)
@@ -349,6 +361,9 @@ fn white_rust(canvas: &mut Canvas, level: f32, rng: &mut Pcg64Mcg) {
     let halo = level * between(rng, 0.0, 0.6);
     canvas.each(|x, y, t| {
         let rho = ((x - cx).powi(2) + (y - cy).powi(2)).sqrt() / radius;
+        if t.part == u8::MAX && rho > 1.4 + halo {
+            return;
+        }
         let value = 0.72 * patch.at(x, y) + 0.28 * grain.at(x, y);
         let alpha = if t.part != u8::MAX {
             smoothstep(threshold - 0.1, threshold + 0.12, value + 0.1 * (1.0 - t.open)) * 0.95
@@ -363,6 +378,9 @@ fn white_rust(canvas: &mut Canvas, level: f32, rng: &mut Pcg64Mcg) {
     });
 }
 
+/// Fresh rust: orange and pale.
+const FRESH: [f32; 3] = [0.42, 0.17, 0.07];
+
 fn rust(canvas: &mut Canvas, level: f32, corrodes: f32, spot: bool, rng: &mut Pcg64Mcg) {
     let young = Texture::new(Surface::Rust, 0.08, rng);
     let old = Texture::new(Surface::Rust, 0.05, rng);
@@ -372,13 +390,19 @@ fn rust(canvas: &mut Canvas, level: f32, corrodes: f32, spot: bool, rng: &mut Pc
     let grain = Noise::new(Grain::Even, 0.35, rng);
     let columns = Noise::new(Grain::Cloud, canvas.radius * 0.7, rng);
     // Orange, red-brown, dark brown.
-    let lightness = between(rng, 0.45, 2.2);
+    let lightness = between(rng, -0.6, 0.9).exp();
     let hue = [
         between(rng, 0.9, 1.15),
         between(rng, 0.85, 1.25),
         between(rng, 0.7, 1.5),
     ];
-    let age = between(rng, 0.1, 0.9);
+    let age = between(rng, 0.1, 1.0);
+    let contrast = between(rng, 0.3, 0.75);
+    let fresh = if rng.random_bool(0.55) {
+        between(rng, 0.1, 0.9)
+    } else {
+        0.0
+    };
     let head = (level * corrodes).powf(0.8) * 1.05;
     let threshold = 1.0 - head;
     let around = level * between(rng, 0.2, 1.0);
@@ -401,10 +425,13 @@ fn rust(canvas: &mut Canvas, level: f32, corrodes: f32, spot: bool, rng: &mut Pc
             smoothstep(0.0, edge + 0.05, value) * spot_strength
         } else if t.part != u8::MAX {
             let favour = 0.12 * smoothstep(0.75, 1.0, rho) + 0.14 * (1.0 - t.open) + 0.2 * t.burr;
-            let value = 0.74 * patch.at(x, y) + 0.26 * grain.at(x, y) + favour;
+            let value = 0.64 * patch.at(x, y) + 0.36 * grain.at(x, y) + favour;
             smoothstep(threshold - 0.05, threshold + 0.1, value) * 0.97
         } else {
             let mut far = (rho - 1.0) / (extent * (0.4 + around));
+            if far > 1.9 + 1.2 * run {
+                return;
+            }
             if run > 0.0 && v > 0.0 {
                 // Water carries it down the sheet.
                 let band = (u / radius).abs();
@@ -420,8 +447,9 @@ fn rust(canvas: &mut Canvas, level: f32, corrodes: f32, spot: bool, rng: &mut Pc
         let a = young.at(x, y);
         let b = old.at(x, y).map(|v| v * 0.5);
         let mut albedo = mix(a, b, smoothstep(age - 0.25, age + 0.25, stain.at(y, x)));
+        albedo = mix(albedo, FRESH, fresh * smoothstep(0.15, 0.85, patch.at(y, x)));
         let scale = broken.at(x, y)[0] / 0.38;
-        let shade = lightness * (0.65 + 0.7 * grain.at(y, x)) * (0.75 + 0.25 * scale.min(1.6));
+        let shade = lightness * (1.0 - contrast + 2.0 * contrast * grain.at(y, x)) * (0.75 + 0.25 * scale.min(1.6));
         for (c, h) in albedo.iter_mut().zip(hue) {
             *c = (*c * h * shade).clamp(0.004, 0.8);
         }
@@ -458,15 +486,22 @@ fn dirt(canvas: &mut Canvas, level: f32, rng: &mut Pcg64Mcg) {
             alpha
         } else {
             let rho = (u * u + v * v).sqrt() / radius;
-            let mut near = (-(rho - 1.0).max(0.0) / 0.22).exp() * smoothstep(0.2, 0.8, ring.at(x, y));
-            if run > 0.0 && v > 0.0 {
+            let mut near = 0.0;
+            if rho < 1.8 {
+                near = (-(rho - 1.0).max(0.0) / 0.22).exp() * smoothstep(0.2, 0.8, ring.at(x, y));
+            }
+            if run > 0.0 && v > 0.0 && u.abs() < radius {
                 near += run
                     * 0.7
-                    * (1.0 - smoothstep(0.3, 1.0, (u / radius).abs()))
+                    * (1.0 - smoothstep(0.3, 1.0, u.abs() / radius))
                     * smoothstep(0.35, 0.9, ring.at(u, 0.15 * v));
             }
             let far = 0.6 * smoothstep(0.62, 0.85, cloud) * ground;
-            level * (0.75 * near + 0.5 * far + 0.5 * cavity * ring.at(x, y)) * (0.7 + 0.5 * grain.at(x, y))
+            let alpha = level * (0.75 * near + 0.5 * far + 0.4 * cavity);
+            if alpha < 0.004 {
+                return;
+            }
+            alpha * (0.7 + 0.5 * grain.at(x, y))
         };
         if alpha > 0.004 {
             t.lay(&matt(soil, rough), alpha);
@@ -506,9 +541,9 @@ fn web(canvas: &mut Canvas, level: f32, rng: &mut Pcg64Mcg) {
         .filter(|t| t.solid)
         .map(|t| t.height)
         .fold(0.0, f32::max);
-    let tone = between(rng, 0.35, 0.8);
+    let tone = between(rng, 0.55, 0.95);
     let silk = matt([tone, tone, tone * between(rng, 0.85, 1.0)], between(rng, 0.4, 0.9));
-    let count = 2 + (level * level * between(rng, 20.0, 60.0) + 6.0 * level) as usize;
+    let count = 2 + (level * level * between(rng, 20.0, 80.0) + 6.0 * level) as usize;
     let strand = |canvas: &mut Canvas, from: [f32; 2], to: [f32; 2], sag: [f32; 2], width: f32, strength: f32| {
         let length = ((to[0] - from[0]).powi(2) + (to[1] - from[1]).powi(2)).sqrt();
         let steps = (length / (0.7 * texel_mm)).ceil().max(1.0) as usize;
@@ -521,13 +556,17 @@ fn web(canvas: &mut Canvas, level: f32, rng: &mut Pcg64Mcg) {
             if gx < 0.0 || gy < 0.0 || gx >= size as f32 || gy >= size as f32 {
                 continue;
             }
-            let alpha = (strength * (width / texel_mm).min(1.0)).clamp(0.0, 0.95);
-            let t: &mut Texel = &mut canvas.texels[gy as usize * size + gx as usize];
+            // Strands end at the grid's border: let them thin out before it shows.
+            let away = (x * x + y * y).sqrt() / half;
+            let alpha = strength * (width / texel_mm).min(1.0) * (1.0 - smoothstep(0.6, 0.96, away));
+            if alpha <= 0.0 {
+                continue;
+            }
             let r = ((x - cx).powi(2) + (y - cy).powi(2)).sqrt();
+            let t: &mut Texel = &mut canvas.texels[gy as usize * size + gx as usize];
             let lying = (top + 0.05) * (1.0 - smoothstep(0.5, 1.0, r / half));
-            if lying > t.height {
+            if t.recess > 0.0 && lying > t.height {
                 t.height += alpha * (lying - t.height);
-                t.filled = 0.0_f32.max(t.filled);
             }
             t.open = t.open.max(0.6 * alpha);
             t.hidden = t.hidden.max(alpha);
@@ -543,7 +582,7 @@ fn web(canvas: &mut Canvas, level: f32, rng: &mut Pcg64Mcg) {
         let from = [cx - sin * aside - cos * back, cy + cos * aside - sin * back];
         let to = [cx - sin * aside + cos * reach, cy + cos * aside + sin * reach];
         let bow = between(rng, -0.12, 0.12) * half;
-        let width = between(rng, 0.03, 0.14);
+        let width = between(rng, 0.015, 0.09);
         let strength = between(rng, 0.35, 0.95);
         strand(canvas, from, to, [-sin * bow, cos * bow], width, strength);
     }
@@ -553,7 +592,11 @@ fn web(canvas: &mut Canvas, level: f32, rng: &mut Pcg64Mcg) {
         let where_mm = Noise::new(Grain::Cloud, canvas.radius * 1.6, rng);
         let most = (level - 0.45) * between(rng, 0.4, 1.3);
         canvas.each(|x, y, t| {
-            let alpha = most * smoothstep(0.3, 0.8, where_mm.at(x, y)) * (0.3 + 0.7 * gauze.at(x, y));
+            let away = (x * x + y * y).sqrt() / half;
+            let alpha = most
+                * smoothstep(0.3, 0.8, where_mm.at(x, y))
+                * (0.3 + 0.7 * gauze.at(x, y))
+                * (1.0 - smoothstep(0.4, 0.92, away));
             if alpha > 0.004 {
                 t.hidden = t.hidden.max(alpha);
                 t.open = t.open.max(0.6 * alpha);
