@@ -101,6 +101,13 @@ impl Relief {
         self.bilinear(&self.open, x_mm, y_mm)
     }
 
+    /// Whether a place belongs to the item's own body rather than to the sheet around it.
+    pub fn is_solid(&self, x_mm: f32, y_mm: f32) -> bool {
+        let Cell { index, fx, fy } = self.cell(x_mm, y_mm);
+        let (right, below) = (usize::from(fx > 0.5), usize::from(fy > 0.5));
+        self.solid[index + right + below * self.size]
+    }
+
     /// Unit normal of the surface.
     pub fn normal(&self, x_mm: f32, y_mm: f32) -> [f32; 3] {
         let step = self.texel_mm;
