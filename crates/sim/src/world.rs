@@ -1,0 +1,534 @@
+//! The physical world that all devices of one cell share: time, the unit on the table, what is off it, the arms.
+
+use crate::SimSettings;
+use crate::arm::SimArm;
+use crate::draw::{draw, mix, signed};
+use crate::faults::{Fault, FaultDraws};
+use crate::layout;
+use crate::log::ActionLog;
+use crate::score::{Action, ActionKind, Score, ScrewScore, UnitScore};
+use cell::device::DriveEnd;
+use geometry::{Base, Camera, CameraModel, Face, Point, Tool, Transform};
+use nalgebra::{UnitQuaternion, Vector3};
+use rand::RngExt;
+use scene::{CoverId, FaceId, FaceTruth, FaceView, Rendered, ScrewId, Sensor, Unit, UnitOptions};
+use std::collections::{BTreeMap, BTreeSet};
+use std::f64::consts::TAU;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+/// The world as its devices hold it.
+pub(crate) type Shared = Arc<Mutex<World>>;
+
+/// Takes the world; a device that panicked while it held it leaves it usable.
+pub(crate) fn lock(world: &Shared) -> MutexGuard<'_, World> {
+    world.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// Time until a fed unit stands on the table, s.
+const FEED_S: f64 = 14.0;
+/// Time to turn another face to the camera, s.
+const TURN_S: f64 = 3.2;
+/// Time to clear the table, s.
+const DISCHARGE_S: f64 = 10.0;
+/// A target may not lie deeper than this behind the sheet, mm: the bit stops at the head.
+const DEEPEST_MM: f64 = 8.0;
+/// Nothing may go below this height above the arm's foot, mm: the table.
+const TABLE_TOP_MM: f64 = 90.0;
+
+/// A job that has to do with covers.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum CoverJob {
+    Pull(CoverId),
+    Drop,
+}
+
+impl CoverJob {
+    /// Covers that a job exists for; the left one leaves with the front.
+    pub(crate) fn pulls() -> impl Iterator<Item = CoverId> {
+        [CoverId::Top, CoverId::Front, CoverId::Right].into_iter()
+    }
+}
+
+/// Something the table is doing.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum TableJob {
+    Feed,
+    Turn(FaceId),
+    Discharge,
+}
+
+/// The unit on the table.
+pub(crate) struct LoadedUnit {
+    pub(crate) unit: Unit,
+    pub(crate) removed: BTreeSet<ScrewId>,
+    pub(crate) covers_off: BTreeSet<CoverId>,
+    pub(crate) attempts: BTreeMap<ScrewId, u32>,
+    pub(crate) presented: Option<FaceId>,
+    truths: BTreeMap<FaceId, Arc<FaceTruth>>,
+    score: UnitScore,
+}
+
+/// A depth picture that came with the last colour picture.
+pub(crate) struct LastShot {
+    pub(crate) state: u64,
+    pub(crate) region: Option<scene::Roi>,
+    pub(crate) rendered: Rendered,
+}
+
+/// Everything physical.
+pub(crate) struct World {
+    t_s: f64,
+    settings: SimSettings,
+    pub(crate) arms: Vec<SimArm>,
+    pub(crate) faults: FaultDraws,
+    pub(crate) stated_camera: CameraModel,
+    pub(crate) true_camera: CameraModel,
+    pub(crate) unit: Option<LoadedUnit>,
+    pub(crate) magnet: bool,
+    pub(crate) held_cover: Option<CoverId>,
+    table: Option<(TableJob, f64)>,
+    fed: u64,
+    pub(crate) exposures: u64,
+    pub(crate) last_shot: Option<LastShot>,
+    pub(crate) reports: Vec<String>,
+    actions: Vec<Action>,
+    done: Vec<UnitScore>,
+    log: Option<ActionLog>,
+}
+
+impl World {
+    pub(crate) fn new(settings: SimSettings) -> Self {
+        let seed = settings.seed;
+        let stated_camera = scene::camera(mix(seed, &[10]));
+        let tool = layout::flange_from_tool();
+        let arms = layout::ARMS
+            .iter()
+            .enumerate()
+            .map(|(i, (name, _))| {
+                let camera = layout::true_base_from_camera(i, seed);
+                SimArm::new(name, mix(seed, &[20, i as u64]), &settings.arms, tool, camera, i == 1)
+            })
+            .collect();
+        Self {
+            t_s: 0.0,
+            faults: FaultDraws::new(mix(seed, &[30]), settings.faults.clone()),
+            true_camera: layout::true_camera(&stated_camera, seed),
+            stated_camera,
+            arms,
+            unit: None,
+            magnet: false,
+            held_cover: None,
+            table: None,
+            fed: 0,
+            exposures: 0,
+            last_shot: None,
+            reports: Vec::new(),
+            actions: Vec::new(),
+            done: Vec::new(),
+            log: None,
+            settings,
+        }
+    }
+
+    pub(crate) fn now_s(&self) -> f64 {
+        self.t_s
+    }
+
+    pub(crate) fn seed(&self) -> u64 {
+        self.settings.seed
+    }
+
+    /// Lets time pass.
+    pub(crate) fn pass(&mut self, s: f64) {
+        self.advance_to(self.t_s + s.max(0.0));
+    }
+
+    /// Moves on to a time; everything that ends on the way happens in its order.
+    pub(crate) fn advance_to(&mut self, t_s: f64) {
+        while let Some(at_s) = self.next_event_s().filter(|at_s| *at_s <= t_s) {
+            self.t_s = self.t_s.max(at_s);
+            self.settle();
+        }
+        self.t_s = self.t_s.max(t_s);
+    }
+
+    /// When something ends by itself next.
+    pub(crate) fn next_event_s(&self) -> Option<f64> {
+        let arms = self.arms.iter().filter_map(SimArm::next_event_s);
+        arms.chain(self.table.map(|(_, at_s)| at_s)).min_by(f64::total_cmp)
+    }
+
+    fn settle(&mut self) {
+        let now_s = self.t_s;
+        if let Some((job, at_s)) = self.table
+            && at_s <= now_s
+        {
+            self.table = None;
+            self.end_table_job(job);
+        }
+        for i in 0..self.arms.len() {
+            match self.arms[i].settle(now_s) {
+                Some(CoverJob::Pull(cover)) => self.pull(i, cover),
+                Some(CoverJob::Drop) => {
+                    self.held_cover = None;
+                    self.record(ActionKind::LaidAside);
+                }
+                None => {}
+            }
+        }
+    }
+
+    pub(crate) fn record(&mut self, kind: ActionKind) {
+        let unit = self.unit.as_ref().map(|u| u.score.index);
+        let action = Action {
+            t_s: self.t_s,
+            unit,
+            kind,
+        };
+        if let Some(log) = &mut self.log {
+            log.append(&action);
+        }
+        self.actions.push(action);
+    }
+
+    /// Brings the world to where its log ends: what was done stays done. The arms are found at home, as after a restart by
+    /// an operator.
+    pub(crate) fn resume(&mut self, actions: Vec<Action>, log: ActionLog) {
+        for action in actions {
+            self.t_s = action.t_s;
+            match &action.kind {
+                ActionKind::Loaded { .. } => {
+                    self.fed = action.unit.unwrap_or(self.fed);
+                    self.load();
+                }
+                ActionKind::Presented { face } => {
+                    if let Some(loaded) = &mut self.unit {
+                        loaded.presented = Some(*face);
+                    }
+                }
+                ActionKind::Drive {
+                    screw: Some(id), end, ..
+                } => self.driven(*id, *end),
+                ActionKind::Drive { .. } => {}
+                ActionKind::Pull { cover, off, .. } => {
+                    self.held_cover = off.then_some(*cover);
+                    if let Some(loaded) = self.unit.as_mut().filter(|_| *off) {
+                        loaded.covers_off.extend(loaded.leaving(*cover));
+                    }
+                }
+                ActionKind::LaidAside => self.held_cover = None,
+                ActionKind::Discharged => self.discharged(),
+            }
+            self.actions.push(action);
+        }
+        self.log = Some(log);
+    }
+
+    /// Why the log could not be written, if so.
+    pub(crate) fn log_error(&self) -> Option<String> {
+        self.log.as_ref().and_then(|log| log.error.clone())
+    }
+
+    // ---- table ----
+
+    pub(crate) fn table_busy(&self) -> bool {
+        self.table.is_some()
+    }
+
+    fn begin_table_job(&mut self, job: TableJob, takes_s: f64) {
+        let slow = if self.faults.happens(Fault::IoDelay) { 3.0 } else { 1.0 };
+        self.table = Some((job, self.t_s + takes_s * slow));
+    }
+
+    pub(crate) fn feed(&mut self) {
+        self.begin_table_job(TableJob::Feed, FEED_S);
+    }
+
+    pub(crate) fn turn(&mut self, face: FaceId) {
+        let Some(loaded) = &mut self.unit else { return };
+        if loaded.presented == Some(face) {
+            return;
+        }
+        loaded.presented = None;
+        self.begin_table_job(TableJob::Turn(face), TURN_S);
+    }
+
+    pub(crate) fn discharge(&mut self) {
+        if let Some(loaded) = &mut self.unit {
+            loaded.presented = None;
+        }
+        self.begin_table_job(TableJob::Discharge, DISCHARGE_S);
+    }
+
+    fn end_table_job(&mut self, job: TableJob) {
+        match job {
+            TableJob::Feed => {
+                let seed = self.load();
+                self.record(ActionKind::Loaded { seed });
+            }
+            TableJob::Turn(face) => {
+                if let Some(loaded) = &mut self.unit {
+                    loaded.presented = Some(face);
+                }
+                self.record(ActionKind::Presented { face });
+            }
+            TableJob::Discharge => {
+                self.record(ActionKind::Discharged);
+                self.discharged();
+            }
+        }
+    }
+
+    /// Puts the next unit on the table; returns its seed.
+    fn load(&mut self) -> u64 {
+        let index = self.fed;
+        self.fed += 1;
+        let seed = unit_seed(self.settings.units_seed, index);
+        let options = UnitOptions {
+            wear: self.settings.wear,
+            decoys: self.settings.decoys,
+            excluded_share: self.settings.excluded_share,
+        };
+        let unit = Unit::sample_with(seed, &options);
+        self.unit = Some(LoadedUnit {
+            score: UnitScore {
+                index,
+                seed,
+                model: unit.model.clone(),
+                theme: unit.theme,
+                exclusion: unit.exclusion,
+                loaded_s: self.t_s,
+                discharged_s: None,
+                screws: Vec::new(),
+                covers_off: Vec::new(),
+            },
+            unit,
+            removed: BTreeSet::new(),
+            covers_off: BTreeSet::new(),
+            attempts: BTreeMap::new(),
+            presented: None,
+            truths: BTreeMap::new(),
+        });
+        seed
+    }
+
+    fn discharged(&mut self) {
+        if let Some(loaded) = self.unit.take() {
+            let mut score = score_of(&loaded);
+            score.discharged_s = Some(self.t_s);
+            self.done.push(score);
+        }
+    }
+
+    // ---- covers ----
+
+    fn pull(&mut self, arm: usize, cover: CoverId) {
+        let slipped = self.faults.happens(Fault::GripperSlip);
+        let mut holding = 0;
+        let mut off = false;
+        if let Some(loaded) = &mut self.unit {
+            let leaving = loaded.leaving(cover);
+            holding = loaded.standing(&leaving).len();
+            let at_hand = loaded.presented.is_some_and(|face| grips(cover, face));
+            off = at_hand && holding == 0 && !slipped && !loaded.covers_off.contains(&cover);
+            if off {
+                loaded.covers_off.extend(leaving);
+            }
+        }
+        self.held_cover = off.then_some(cover);
+        self.record(ActionKind::Pull {
+            arm: self.arms[arm].name.clone(),
+            cover,
+            off,
+            held_by: holding,
+        });
+    }
+
+    // ---- what stands where ----
+
+    /// Where a face of the unit on the table stands before the camera.
+    fn camera_from_face(&self, loaded: &LoadedUnit, face: FaceId) -> Option<Transform<Camera, Face>> {
+        let design = loaded.unit.face(face)?;
+        let mut rng = draw(loaded.score.seed, &[40, face as u64]);
+        let tilt_rad = rng.random::<f64>().sqrt() * 6f64.to_radians();
+        let toward = rng.random_range(0.0..TAU);
+        let turn_rad = signed(&mut rng) * 4f64.to_radians();
+        let offset = [4.0, 4.0, 12.0].map(|mm| mm * signed(&mut rng));
+        let drawn = layout::station(
+            [design.width_mm, design.height_mm],
+            if face == FaceId::FrontInner {
+                layout::INNER_DEPTH_MM
+            } else {
+                0.0
+            },
+            turn_rad,
+            UnitQuaternion::from_scaled_axis(Vector3::new(toward.cos(), toward.sin(), 0.0) * tilt_rad),
+            offset,
+        );
+        Some(layout::true_base_from_camera(0, self.settings.seed).inverse() * layout::drawn_base_from_camera(0) * drawn)
+    }
+
+    /// The presented face as the camera sees it, with a new exposure.
+    pub(crate) fn view(&self) -> Option<FaceView> {
+        let loaded = self.unit.as_ref()?;
+        let face = loaded.presented?;
+        Some(FaceView {
+            design: loaded.unit.face(face)?.clone(),
+            camera: self.true_camera,
+            camera_from_face: self.camera_from_face(loaded, face)?,
+            scene_seed: mix(loaded.score.seed, &[41, face as u64]),
+            sensor: Sensor {
+                noise_seed: mix(self.settings.seed, &[42, self.exposures]),
+                ..Sensor::sample(mix(loaded.score.seed, &[43]))
+            },
+            removed_screws: loaded.removed.iter().copied().collect(),
+        })
+    }
+
+    /// The truth of the presented face with all its screws, made when first asked for.
+    pub(crate) fn truth(&mut self) -> Option<Arc<FaceTruth>> {
+        let face = self.unit.as_ref()?.presented?;
+        if let Some(known) = self.unit.as_ref()?.truths.get(&face) {
+            return Some(known.clone());
+        }
+        let whole = FaceView {
+            removed_screws: Vec::new(),
+            ..self.view()?
+        };
+        let truth = Arc::new(scene::truth(&whole));
+        self.unit.as_mut()?.truths.insert(face, truth.clone());
+        Some(truth)
+    }
+
+    /// A number that changes whenever the picture would.
+    pub(crate) fn state_number(&self) -> u64 {
+        match &self.unit {
+            None => 0,
+            Some(u) => {
+                let face = u.presented.map_or(99, |f| f as u64);
+                mix(
+                    u.score.index,
+                    &[face, u.removed.len() as u64, u.covers_off.len() as u64],
+                )
+            }
+        }
+    }
+
+    /// An arm whose tool stands between the camera and the unit, other than one that shows the jig.
+    pub(crate) fn arm_in_view(&self) -> Option<&SimArm> {
+        self.arms.iter().find(|arm| {
+            let tool = arm.camera_from_true_tool(self.t_s) * Point::new(0.0, 0.0, 0.0);
+            !arm.jig
+                && self
+                    .stated_camera
+                    .project(tool)
+                    .is_some_and(|pixel| self.stated_camera.contains(pixel))
+        })
+    }
+
+    /// Why an arm may not go there, if so.
+    pub(crate) fn keep_out(&self, arm: usize, base_from_tool: Transform<Base, Tool>) -> Option<String> {
+        let tip: Point<Base> = base_from_tool * Point::new(0.0, 0.0, 0.0);
+        if tip.z_mm() < TABLE_TOP_MM {
+            return Some(format!(
+                "{:.1} mm above the foot lies in the table, whose top is at {TABLE_TOP_MM} mm",
+                tip.z_mm()
+            ));
+        }
+        let loaded = self.unit.as_ref()?;
+        let tip_in_camera = self.arms[arm].base_from_camera.inverse() * tip;
+        let Some(face) = loaded.presented else {
+            return (tip_in_camera.z_mm() > layout::FACE_DEPTH_MM - 150.0)
+                .then(|| "the table is turning; wait until a face is presented".into());
+        };
+        let design = loaded.unit.face(face)?;
+        let p = self.camera_from_face(loaded, face)?.inverse() * tip_in_camera;
+        let beside = p.x_mm().abs() > 0.5 * design.width_mm || p.y_mm().abs() > 0.5 * design.height_mm;
+        let items = design.screws.iter().map(|s| s.placed.height_mm);
+        let lowest = items.fold(0.0, f64::min);
+        let deep_mm = p.z_mm() + lowest;
+        (!beside && deep_mm > DEEPEST_MM).then(|| format!("the target lies {deep_mm:.1} mm inside the unit"))
+    }
+
+    /// Score of everything so far.
+    pub(crate) fn score(&self) -> Score {
+        let mut units = self.done.clone();
+        units.extend(self.unit.as_ref().map(score_of));
+        Score {
+            units,
+            actions: self.actions.clone(),
+        }
+    }
+
+    /// Notes what the driver did to a screw.
+    pub(crate) fn driven(&mut self, screw: ScrewId, end: DriveEnd) {
+        let Some(loaded) = &mut self.unit else { return };
+        *loaded.attempts.entry(screw).or_default() += 1;
+        if end == DriveEnd::Removed {
+            loaded.removed.insert(screw);
+        }
+    }
+}
+
+impl LoadedUnit {
+    /// The cover and those that come off with it.
+    fn leaving(&self, cover: CoverId) -> Vec<CoverId> {
+        let covers = self.unit.covers.iter();
+        covers
+            .filter(|c| c.id == cover || c.leaves_with == Some(cover) || leaves_with(c.id) == Some(cover))
+            .map(|c| c.id)
+            .collect()
+    }
+
+    /// Screws that still hold any of these covers.
+    fn standing(&self, covers: &[CoverId]) -> Vec<ScrewId> {
+        self.unit
+            .covers
+            .iter()
+            .filter(|c| covers.contains(&c.id))
+            .flat_map(|c| c.screws.iter().copied())
+            .filter(|s| !self.removed.contains(s))
+            .collect()
+    }
+}
+
+/// Which face has to stand before the gripper for a cover.
+fn grips(cover: CoverId, face: FaceId) -> bool {
+    match cover {
+        CoverId::Top => face == FaceId::Top,
+        CoverId::Right => face == FaceId::Right,
+        CoverId::Left => face == FaceId::Left,
+        CoverId::Front | CoverId::FrontInner => matches!(face, FaceId::Front | FaceId::FrontInner),
+    }
+}
+
+/// Covers without a job of their own.
+fn leaves_with(cover: CoverId) -> Option<CoverId> {
+    matches!(cover, CoverId::Left | CoverId::FrontInner).then_some(CoverId::Front)
+}
+
+fn score_of(loaded: &LoadedUnit) -> UnitScore {
+    let screws = loaded.unit.screws().map(|(face, screw)| {
+        let seen = loaded.truths.get(&face);
+        ScrewScore {
+            id: screw.id,
+            face,
+            removed: loaded.removed.contains(&screw.id),
+            seized: screw.seized,
+            attempts: loaded.attempts.get(&screw.id).copied().unwrap_or(0),
+            detectable: seen
+                .and_then(|t| t.screws.iter().find(|s| s.id == screw.id))
+                .map(|s| s.detectable),
+        }
+    });
+    UnitScore {
+        screws: screws.collect(),
+        covers_off: loaded.covers_off.iter().copied().collect(),
+        ..loaded.score.clone()
+    }
+}
+
+/// Seed of the `index`-th unit of a series.
+pub fn unit_seed(units_seed: u64, index: u64) -> u64 {
+    mix(units_seed, &[50, index])
+}
