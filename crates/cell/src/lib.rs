@@ -1,5 +1,6 @@
 //! The disassembly program: device traits and drivers, capture loop, planning, outcomes, journal.
 
+pub mod calibrate;
 pub mod capture;
 pub mod config;
 pub mod device;

@@ -2,9 +2,9 @@
 
 use crate::config::{Approach, Drive, Timeouts};
 use crate::device::{Arm, ArmState, Clock, DeviceError, DriveEnd, DriveProgram, DriverTool, Motion, RobotArm, Ticket, jobs};
-use crate::plan::SafeTarget;
+use crate::plan::{SafeTarget, tool_pose};
 use crate::record::Burst;
-use geometry::{Base, Tool, Transform};
+use geometry::{Base, Direction, Point, Tool, Transform};
 use std::sync::Arc;
 
 /// Position and angle within which an arm counts as arrived, when only its state can tell.
@@ -144,7 +144,13 @@ impl Mover<'_> {
         self.go(target.contact_pose(), motion).await
     }
 
-    /// The only place that sends a move. Private: poses come from [`SafeTarget`]s alone.
+    /// Shows the marker at a place of a calibration plan: the only moves that are not to a [`SafeTarget`], made on an empty table
+    /// with a jig in place of the bit, since there is no calibrated volume yet.
+    pub(crate) async fn visit(&self, tip: Point<Base>, approach: Direction<Base>) -> Result<(), DeviceError> {
+        self.go(tool_pose(tip, approach), Motion::Joint).await
+    }
+
+    /// The only place that sends a move. Private: poses come from [`SafeTarget`]s and calibration plans alone.
     async fn go(&self, pose: Transform<Base, Tool>, motion: Motion) -> Result<(), DeviceError> {
         match self.robot().move_to(pose, motion).await {
             Ok(ticket) => self.arrive(ticket, Some(pose)).await,
