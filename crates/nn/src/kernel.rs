@@ -15,6 +15,9 @@ pub(crate) fn padded(channels: usize) -> usize {
     channels.next_multiple_of(LANES)
 }
 
+/// Vectors of the longest piece of a sum: two thirds of the usual first cache.
+const PIECE_BYTES: usize = 20 * 1024;
+
 /// The widest instructions to use.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) enum Level {
@@ -107,23 +110,49 @@ impl Product<'_> {
         }
     }
 
-    /// Cuts the channels into groups of one to three vectors.
+    /// Cuts the channels into groups of one to three vectors, and the sums into pieces whose vectors stay in the first
+    /// cache while the whole row goes by. Between pieces the sums wait in the output, so no bit changes.
     #[inline(always)]
     unsafe fn columns<S: Simd>(&self) {
         let total = self.channels / S::LANES;
         let mut done = 0;
         while done < total {
             let rest = total - done;
-            let group = if rest == 4 { 2 } else { rest.min(3) };
+            // As many as leave room for enough pixels to keep the units busy.
+            let most = match S::REGISTERS {
+                ..16 => 1,
+                16..32 => 2,
+                _ => 3,
+            };
+            let group = if rest == 4 { 2 } else { rest.min(most) };
             let channel = done * S::LANES;
-            unsafe {
-                match group {
-                    1 => self.pixels::<S, 1>(channel),
-                    2 => self.pixels::<S, 2>(channel),
-                    _ => self.pixels::<S, 3>(channel),
-                }
-            }
             done += group;
+            // A step's vectors, and the rest of the cache line that they end in.
+            let step_bytes = (group * S::LANES).min(self.vector_step) * 4 + 64;
+            let together = (PIECE_BYTES / (step_bytes * self.length)).max(1);
+            let mut rest = self.segments;
+            let mut start = self.start;
+            loop {
+                let (segments, later) = rest.split_at(together.min(rest.len()));
+                rest = later;
+                let piece = Product {
+                    segments,
+                    start,
+                    relu: self.relu && rest.is_empty(),
+                    ..*self
+                };
+                unsafe {
+                    match group {
+                        1 => piece.pixels::<S, 1>(channel),
+                        2 => piece.pixels::<S, 2>(channel),
+                        _ => piece.pixels::<S, 3>(channel),
+                    }
+                }
+                if rest.is_empty() {
+                    break;
+                }
+                start = Start::Output;
+            }
         }
     }
 
@@ -131,7 +160,7 @@ impl Product<'_> {
     #[inline(always)]
     unsafe fn pixels<S: Simd, const B: usize>(&self, channel: usize) {
         // Beside the sums, the registers hold a vector for each column and the scalar.
-        let fits = |pixels: usize| pixels * B + B < S::REGISTERS;
+        let fits = |pixels: usize| pixels * B + B + 1 < S::REGISTERS;
         let mut done = 0;
         while done < self.pixels {
             let rest = self.pixels - done;
@@ -143,6 +172,9 @@ impl Product<'_> {
                 } else if fits(8) && rest >= 8 {
                     self.block::<S, 8, B>(done, channel);
                     8
+                } else if fits(6) && !fits(8) && rest >= 6 && rest != 8 {
+                    self.block::<S, 6, B>(done, channel);
+                    6
                 } else if rest >= 4 {
                     self.block::<S, 4, B>(done, channel);
                     4
@@ -224,7 +256,8 @@ trait Simd: Copy {
 
 impl Simd for [f32; 8] {
     const LANES: usize = 8;
-    const REGISTERS: usize = 16;
+    /// Pairs of 128-bit registers.
+    const REGISTERS: usize = if cfg!(target_arch = "aarch64") { 16 } else { 8 };
 
     #[inline(always)]
     unsafe fn splat(value: f32) -> Self {

@@ -408,7 +408,7 @@ pub(crate) fn read_parameters(reader: &Reader) -> Result<Vec<ConvParameters>, Nn
         } = layer
         {
             let tensor = |name: &str, shape: &[usize]| reader.tensor(&format!("layers.{index}.{name}"), shape);
-            parameters.push(ConvParameters {
+            let convolution = ConvParameters {
                 weight: tensor("weight", &[out, channels[index], kernel, kernel])?,
                 bias: if batch_norm {
                     Vec::new()
@@ -425,7 +425,12 @@ pub(crate) fn read_parameters(reader: &Reader) -> Result<Vec<ConvParameters>, Nn
                 } else {
                     None
                 },
-            });
+            };
+            let norm = convolution.norm.iter();
+            if norm.flat_map(|norm| &norm.variance).any(|&v| v < 0.0) {
+                return Err(NnError::Format(format!("layer {index} has a negative variance")));
+            }
+            parameters.push(convolution);
         }
     }
     Ok(parameters)

@@ -361,6 +361,11 @@ fn bad_files_are_refused_in_words() {
     let end = diverged.len();
     diverged[end - 4..].copy_from_slice(&f32::NAN.to_le_bytes());
     assert!(matches!(error(&diverged), NnError::NotFinite(_)));
+    // The last tensor but two (weight and bias of the last layer) is a running variance.
+    let mut negative = bytes.clone();
+    let at = end - 4 * (2 + 2 * 16 + 1);
+    negative[at..at + 4].copy_from_slice(&(-1f32).to_le_bytes());
+    assert!(matches!(error(&negative), NnError::Format(_)));
     let missing = Network::load("no/such.safetensors").unwrap_err().to_string();
     assert!(missing.contains("no/such.safetensors"), "{missing}");
 }
