@@ -71,6 +71,51 @@ impl Bump {
         }
     }
 
+    /// Height and slope at a place, for what changes too slowly to be followed within a few millimetres.
+    pub fn slow_at(&self, p: Xy) -> Option<(f32, Xy)> {
+        let Bump::Buckle { waves, amplitude, .. } = self else {
+            return None;
+        };
+        let (mut height, mut slope) = (0.0, [0.0; 2]);
+        for w in waves {
+            let (sin, cos) = (p[0] * w[0] + p[1] * w[1] + w[2]).sin_cos();
+            height += amplitude * sin;
+            slope[0] += amplitude * w[0] * cos;
+            slope[1] += amplitude * w[1] * cos;
+        }
+        Some((height, slope))
+    }
+
+    /// Whether it changes nothing within `reach` of a place.
+    pub fn is_nothing_within(&self, p: Xy, reach: f32) -> bool {
+        match self {
+            Bump::Plateau { shape, soft, .. } => shape.distance(p) > reach + soft,
+            Bump::Wave { shape, .. } => shape.distance(p) > reach,
+            Bump::Dent { center, radius, .. } => (p[0] - center[0]).hypot(p[1] - center[1]) > 1.6 * radius + reach,
+            Bump::Buckle { .. } | Bump::Hood { .. } => false,
+        }
+    }
+
+    /// The most that it may raise the sheet, mm.
+    pub fn raise(&self) -> f32 {
+        match self {
+            Bump::Plateau { height, .. } | Bump::Dent { height, .. } => height.max(0.0),
+            Bump::Wave { amplitude, .. } => *amplitude,
+            Bump::Buckle { amplitude, .. } => 3.0 * amplitude,
+            Bump::Hood { height, .. } => *height,
+        }
+    }
+
+    /// The most that it may lower the sheet, mm.
+    pub fn depth(&self) -> f32 {
+        match self {
+            Bump::Plateau { height, .. } | Bump::Dent { height, .. } => (-height).max(0.0),
+            Bump::Wave { amplitude, .. } => *amplitude,
+            Bump::Buckle { amplitude, .. } => 3.0 * amplitude,
+            Bump::Hood { .. } => 0.0,
+        }
+    }
+
     #[inline]
     pub fn height(&self, p: Xy) -> f32 {
         match self {
@@ -140,6 +185,9 @@ pub(crate) struct Layer {
     pub bumps: Vec<Bump>,
     pub decals: Vec<Decal>,
     pub paint: Paint,
+    /// The most that its bumps and edge lower and raise it, mm: see [`settle`](Self::settle).
+    pub sunk_mm: f32,
+    pub raised_mm: f32,
 }
 
 impl Layer {
@@ -154,7 +202,15 @@ impl Layer {
             bumps: Vec::new(),
             decals: Vec::new(),
             paint,
+            sunk_mm: 0.0,
+            raised_mm: 0.0,
         }
+    }
+
+    /// To be called once all bumps are there: between which heights the sheet lies.
+    pub fn settle(&mut self) {
+        self.sunk_mm = self.edge_mm + self.bumps.iter().map(Bump::depth).sum::<f32>().min(25.0);
+        self.raised_mm = self.bumps.iter().map(Bump::raise).sum::<f32>().min(12.0);
     }
 
     pub fn cut(&mut self, shape: Shape, wall_mm: f32) {

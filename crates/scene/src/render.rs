@@ -6,6 +6,7 @@
 use crate::bake::{SheetFinish, bake};
 use crate::fastener::{Decoy, Item, Kind};
 use crate::layer::{Bump, Cutout, Layer, Ray, Tube, segment_foot};
+use crate::paint::Decal;
 use crate::product::Placed;
 use crate::relief::{Material, Relief};
 use crate::shade::Lighting;
@@ -83,32 +84,63 @@ impl Hit {
     }
 }
 
-/// A layer as far as it matters in a block.
+/// A layer as far as it can be seen in a block.
 struct Near<'a> {
     index: usize,
     layer: &'a Layer,
     cutouts: Vec<&'a Cutout>,
     bumps: Vec<&'a Bump>,
+    decals: Vec<&'a Decal>,
+    /// The block lies wholly within the outline.
+    inside: bool,
+    /// Radius of the outline's edge, 0 where the edge is far.
+    edge_mm: f32,
+    /// What changes too slowly to be followed within a block: height and slope at its middle.
+    slow: Slow,
+}
+
+/// A plane that stands for a slow change of height.
+#[derive(Clone, Copy, Default)]
+struct Slow {
+    center: Xy,
+    height: f32,
+    slope: Xy,
 }
 
 impl Near<'_> {
     #[inline]
+    fn is_flat(&self) -> bool {
+        self.bumps.is_empty() && self.edge_mm <= 0.0
+    }
+
+    #[inline]
     fn rise(&self, p: Xy) -> f32 {
-        let mut h = 0.0;
+        let slow = &self.slow;
+        let mut h =
+            slow.height + slow.slope[0] * (p[0] - slow.center[0]) + slow.slope[1] * (p[1] - slow.center[1]);
         for bump in &self.bumps {
             h += bump.height(p);
         }
-        let edge = self.layer.edge_mm;
+        let edge = self.edge_mm;
         if edge > 0.0 {
             let d = self.layer.shape.distance(p) + edge;
             if d > 0.0 {
-                let d = d.min(edge);
+                let d = d.min(0.98 * edge);
                 h -= edge - (edge * edge - d * d).max(0.0).sqrt();
             }
         }
         h
     }
+}
 
+/// A layer that may keep light from a block.
+struct Caster<'a> {
+    index: usize,
+    layer: &'a Layer,
+    cutouts: Vec<&'a Cutout>,
+}
+
+impl Caster<'_> {
     /// Positive outside the sheet or in an opening.
     #[inline]
     fn solid_distance(&self, p: Xy) -> f32 {
@@ -120,12 +152,22 @@ impl Near<'_> {
     }
 }
 
-/// What matters in a block.
+/// What can be seen in a block.
 struct Nearby<'a> {
     layers: Vec<Near<'a>>,
     /// (tube, segment)
     segments: Vec<(usize, usize)>,
     spots: Vec<(&'a Spot, &'a Relief)>,
+}
+
+/// What keeps light from a block.
+struct Shade<'a> {
+    /// For every light: nothing of it arrives, or the sheets that may be in its way.
+    lights: Vec<(bool, Vec<Caster<'a>>)>,
+    /// Sheets that hide part of the surroundings.
+    open: Vec<Caster<'a>>,
+    /// (tube, segment) for every light.
+    segments: Vec<Vec<(usize, usize)>>,
 }
 
 fn lerp(a: f32, b: f32, t: f32) -> f32 {
@@ -184,6 +226,7 @@ impl Prepared {
         let mut sheetwork = view.design.sheetwork.clone();
         crate::backdrop::surround(&mut sheetwork, &view.design, &mut rng);
         let mut layers = sheetwork.layers;
+        layers.iter_mut().for_each(Layer::settle);
         layers.sort_by(|a, b| b.top_mm.total_cmp(&a.top_mm));
         let mut spots: Vec<Spot> = Vec::new();
         for screw in &view.design.screws {
@@ -281,31 +324,44 @@ impl Prepared {
             let (x, y) = ((i % WIDE) as f32 - 1.0, (i / WIDE) as f32 - 1.0);
             *hit = self.meet(&nearby, &rays.at(x, y).0);
         }
+        let mut heights = (f32::MAX, f32::MIN);
+        for hit in &hits {
+            heights = (heights.0.min(hit.height), heights.1.max(hit.height));
+        }
+        let shade = self.shade(&rays, heights, !nearby.spots.is_empty());
         for y in 0..BLOCK {
             for x in 0..BLOCK {
                 let i = (y + 1) * WIDE + x + 1;
                 let hit = &hits[i];
-                let edge = [i - 1, i + 1, i - WIDE, i + WIDE]
-                    .iter()
-                    .any(|&j| !hits[j].same_surface(hit) || (hits[j].height - hit.height).abs() > 1.5);
                 let (ray, t0, dt) = rays.at(x as f32, y as f32);
-                let on_item = nearby.spots.iter().any(|(spot, relief)| {
+                let on_head = nearby.spots.iter().any(|(spot, _)| {
                     let p = ray.at_height(spot.placed.height_mm as f32);
                     let (dx, dy) = (p[0] - spot.placed.at_mm[0] as f32, p[1] - spot.placed.at_mm[1] as f32);
-                    relief.contains(dx, dy)
+                    let reach = 0.58 * spot.placed.item.diameter_mm as f32 + 0.8;
+                    dx * dx + dy * dy < reach * reach
                 });
-                let samples = if on_item { 3 } else if edge { 3 } else { 1 };
+                let edge = || {
+                    [i - 1, i + 1, i - WIDE, i + WIDE]
+                        .iter()
+                        .any(|&j| !hits[j].same_surface(hit) || (hits[j].height - hit.height).abs() > 1.5)
+                };
+                let samples = if on_head {
+                    3
+                } else if edge() {
+                    2
+                } else {
+                    1
+                };
                 let mut sum = [0.0f32; 3];
                 let mut depth = 0.0;
                 for sy in 0..samples {
                     for sx in 0..samples {
                         let offset = |s: usize| (s as f32 + 0.5) / samples as f32 - 0.5;
-                        let (px, py) = (x as f32 + offset(sx), y as f32 + offset(sy));
                         let (color, height) = if samples == 1 {
-                            self.color(&nearby, &ray, *hit)
+                            self.color(&nearby, &shade, &ray, *hit)
                         } else {
-                            let ray = rays.at(px, py).0;
-                            self.color(&nearby, &ray, self.meet(&nearby, &ray))
+                            let ray = rays.at(x as f32 + offset(sx), y as f32 + offset(sy)).0;
+                            self.color(&nearby, &shade, &ray, self.meet(&nearby, &ray))
                         };
                         for k in 0..3 {
                             sum[k] += color[k];
@@ -329,28 +385,71 @@ impl Prepared {
     }
 
     fn nearby_rays(&self, corners: [Ray; 4], items: bool) -> Nearby<'_> {
-        let seen = |low: f32, high: f32| {
-            Bounds::of_points(corners.iter().flat_map(|r| [r.at_height(low), r.at_height(high)]))
-        };
+        let seen =
+            |low: f32, high: f32| Bounds::of_points(corners.iter().flat_map(|r| [r.at_height(low), r.at_height(high)]));
         let mut layers = Vec::new();
         for (index, layer) in self.layers.iter().enumerate() {
-            let here = seen(layer.top_mm - layer.wall_mm - 3.0, layer.top_mm + 12.0);
-            if !layer.bounds.grown(SHADOW_MM).meets(&here) {
+            let here = seen(layer.top_mm - layer.wall_mm.min(600.0) - 3.0, layer.top_mm + 12.0);
+            if !layer.bounds.meets(&here) {
                 continue;
             }
-            let cutouts = layer.cutouts.iter().filter(|c| c.bounds.grown(SHADOW_MM).meets(&here));
-            let bumps = layer.bumps.iter().filter(|b| b.bounds().meets(&here));
+            let at_top = seen(layer.top_mm - layer.sunk_mm - 0.5, layer.top_mm + layer.raised_mm + 0.5);
+            let (center, half) = at_top.middle();
+            let outside = layer.shape.distance(center);
+            // the outline and openings count down to the foot of their walls
+            let (wide, wide_half) = here.middle();
+            if layer.shape.distance(wide) > wide_half {
+                continue;
+            }
+            let cutouts: Vec<_> = layer
+                .cutouts
+                .iter()
+                .filter(|c| c.bounds.meets(&at_top) && c.shape.distance(center) < half)
+                .collect();
+            let mut slow = Slow {
+                center,
+                ..Slow::default()
+            };
+            let mut bumps = Vec::new();
+            for bump in &layer.bumps {
+                if !bump.bounds().meets(&at_top) {
+                    continue;
+                }
+                if let Some((height, slope)) = bump.slow_at(center) {
+                    slow.height += height;
+                    slow.slope[0] += slope[0];
+                    slow.slope[1] += slope[1];
+                } else if !bump.is_nothing_within(center, half) {
+                    bumps.push(bump);
+                }
+            }
+            let decals = layer.decals.iter().filter(|d| d.bounds().meets(&at_top));
+            let inside = outside < -half;
             layers.push(Near {
                 index,
                 layer,
-                cutouts: cutouts.collect(),
-                bumps: bumps.collect(),
+                cutouts,
+                bumps,
+                decals: decals.collect(),
+                inside,
+                edge_mm: if outside < -(half + layer.edge_mm) { 0.0 } else { layer.edge_mm },
+                slow,
             });
+            // nothing below a closed sheet can be seen
+            if let Some(last) = layers.last()
+                && last.inside
+                && last.cutouts.is_empty()
+            {
+                break;
+            }
         }
         let mut segments = Vec::new();
         for (t, tube) in self.tubes.iter().enumerate() {
             for (s, pair) in tube.points.windows(2).enumerate() {
-                let here = seen(pair[0][2].min(pair[1][2]) - tube.radius, pair[0][2].max(pair[1][2]) + tube.radius);
+                let here = seen(
+                    pair[0][2].min(pair[1][2]) - tube.radius,
+                    pair[0][2].max(pair[1][2]) + tube.radius,
+                );
                 let bounds = Bounds::of_points(pair.iter().map(|p| [p[0], p[1]]));
                 if bounds.grown(tube.radius + 25.0).meets(&here) {
                     segments.push((t, s));
@@ -376,11 +475,100 @@ impl Prepared {
         }
     }
 
+    /// What keeps light from the places of a block that lie between two heights.
+    fn shade(&self, rays: &Rays, heights: (f32, f32), items: bool) -> Shade<'_> {
+        let (low, high) = if items {
+            (heights.0 - 6.0, heights.1 + 8.0)
+        } else {
+            (heights.0 - 0.3, heights.1 + 0.3)
+        };
+        let mid = 0.5 * (low + high);
+        let corners = [(-1.0, -1.0), (17.0, -1.0), (-1.0, 17.0), (17.0, 17.0)].map(|(x, y)| rays.at(x, y).0);
+        let here = Bounds::of_points(corners.iter().flat_map(|r| [r.at_height(low), r.at_height(high)]));
+        let (center, half) = here.middle();
+        let play = 0.5 * (high - low);
+        let caster = |index: usize, region: &Bounds| {
+            let layer = &self.layers[index];
+            Caster {
+                index,
+                layer,
+                cutouts: layer.cutouts.iter().filter(|c| c.bounds.meets(region)).collect(),
+            }
+        };
+        let higher = self.layers.iter().take_while(|l| l.top_mm > low + 0.05);
+        let mut lights = Vec::new();
+        let mut segments = Vec::new();
+        for light in &self.lighting.lights {
+            let incoming = light.at([center[0], center[1], mid]);
+            let rise = incoming.toward[2].max(0.05);
+            let along = [incoming.toward[0] / rise, incoming.toward[1] / rise];
+            let run = along[0].hypot(along[1]);
+            let mut dark = false;
+            let mut casters = Vec::new();
+            for (index, layer) in higher.clone().enumerate() {
+                let above = (layer.top_mm - mid).max(0.0);
+                let foot = (above - layer.wall_mm).max(0.0);
+                let far = [center[0] + above * along[0], center[1] + above * along[1]];
+                let near = [center[0] + foot * along[0], center[1] + foot * along[1]];
+                let width = incoming.softness * (above + play) + 0.3 + half + play * run + 0.02 * above;
+                let region = Bounds::of_points([far, near]).grown(width);
+                if !layer.bounds.meets(&region) {
+                    continue;
+                }
+                let reach = 0.5 * (above - foot) * run;
+                let between = [0.5 * (far[0] + near[0]), 0.5 * (far[1] + near[1])];
+                if layer.shape.distance(between) > width + reach {
+                    continue;
+                }
+                let caster = caster(index, &region);
+                // wholly in the umbra; never for what may be the sheet itself
+                if layer.top_mm > high + 0.5 && caster.solid_distance(far) < -width {
+                    dark = true;
+                    break;
+                }
+                casters.push(caster);
+            }
+            let mut cords = Vec::new();
+            if !dark {
+                for (t, tube) in self.tubes.iter().enumerate() {
+                    for (s, pair) in tube.points.windows(2).enumerate() {
+                        let level = pair[0][2].max(pair[1][2]) - mid;
+                        if level < -play {
+                            continue;
+                        }
+                        let far = [center[0] + level * along[0], center[1] + level * along[1]];
+                        let spread = (pair[0][2] - pair[1][2]).abs() + play;
+                        let width = incoming.softness * level.max(0.0) + 0.5 + half + spread * run + tube.radius;
+                        let bounds = Bounds::of_points(pair.iter().map(|p| [p[0], p[1]]));
+                        if bounds.grown(width).meets(&Bounds::around(far, [0.0; 2])) {
+                            cords.push((t, s));
+                        }
+                    }
+                }
+            }
+            lights.push((dark, casters));
+            segments.push(cords);
+        }
+        let mut open = Vec::new();
+        for (index, layer) in higher.enumerate() {
+            let above = (layer.top_mm - low).max(0.0);
+            if above < 0.4 {
+                break;
+            }
+            // beyond this what is hidden falls below a hundredth
+            let reach = 4.0 * (0.45 * above.min(120.0) + 0.2) + half;
+            if layer.bounds.grown(reach).meets(&here) && layer.shape.distance(center) < reach {
+                open.push(caster(index, &here.grown(reach)));
+            }
+        }
+        Shade { lights, open, segments }
+    }
+
     /// The first sheet, wall or tube that a ray meets.
     fn meet(&self, nearby: &Nearby, ray: &Ray) -> Hit {
         let mut best = Hit {
-            height: -5000.0,
-            at: ray.at_height(-5000.0),
+            height: FLOOR_MM,
+            at: ray.at_height(FLOOR_MM),
             layer: usize::MAX,
             part: Part::Nothing,
         };
@@ -409,8 +597,7 @@ impl Prepared {
             }
             let mut height = layer.top_mm;
             let mut p = ray.at_height(height);
-            let outside = layer.shape.distance(p);
-            if outside > 0.0 {
+            if !near.inside && layer.shape.distance(p) > 0.0 {
                 if layer.wall_mm <= 0.0 {
                     continue;
                 }
@@ -450,11 +637,10 @@ impl Prepared {
             if open {
                 continue;
             }
-            if !near.bumps.is_empty() || layer.edge_mm > 0.0 {
-                for _ in 0..2 {
-                    height = layer.top_mm + near.rise(p);
-                    p = ray.at_height(height);
-                }
+            let looks = if near.is_flat() { 1 } else { 2 };
+            for _ in 0..looks {
+                height = layer.top_mm + near.rise(p);
+                p = ray.at_height(height);
             }
             if height > best.height {
                 best = Hit {
@@ -469,7 +655,7 @@ impl Prepared {
     }
 
     /// Radiance along a ray whose first sheet is known, and the height at which it ends.
-    fn color(&self, nearby: &Nearby, ray: &Ray, hit: Hit) -> ([f32; 3], f32) {
+    fn color(&self, nearby: &Nearby, shade: &Shade, ray: &Ray, hit: Hit) -> ([f32; 3], f32) {
         let view = unit([ray.slope[0], ray.slope[1], 1.0]);
         let mut point = [hit.at[0], hit.at[1], hit.height];
         let (mut material, mut normal) = self.surface(nearby, &hit);
@@ -495,21 +681,29 @@ impl Prepared {
                 continue;
             }
             material = blend(&material, &own, cover);
-            normal = relief.normal(q[0], q[1]);
             open = relief.open(q[0], q[1]);
-            point = [q[0] + x, q[1] + y, base + q[2]];
+            let tilt = relief.normal(q[0], q[1]);
+            if mounted && q[2].abs() < 0.25 && !solid_at(relief, q[0], q[1]) {
+                // dirt and wear on the sheet follow the sheet's own slopes
+                let (a, b) = (tilt[2].max(0.05), normal[2].max(0.05));
+                normal = unit([tilt[0] / a + normal[0] / b, tilt[1] / a + normal[1] / b, 1.0]);
+                point[2] += q[2];
+            } else {
+                normal = tilt;
+                point = [q[0] + x, q[1] + y, base + q[2]];
+            }
             on_spot = Some(k);
             break;
         }
-        open *= self.openness(nearby, &hit, point);
+        open *= self.openness(shade, &hit, point);
         let mut visible = [1.0f32; 8];
-        for (light, seen) in self.lighting.lights.iter().zip(&mut visible) {
+        for (index, (light, seen)) in self.lighting.lights.iter().zip(&mut visible).enumerate() {
             let incoming = light.at(point);
             if dot(incoming.toward, normal) < -0.5 {
                 *seen = 0.0;
                 continue;
             }
-            *seen = self.lit(nearby, &hit, point, incoming.toward, incoming.softness);
+            *seen = self.lit(shade, index, &hit, point, incoming.toward, incoming.softness);
             for (k, (spot, relief)) in nearby.spots.iter().enumerate() {
                 if *seen <= 0.0 {
                     break;
@@ -555,18 +749,14 @@ impl Prepared {
                 }
                 let normal = best.map_or([0.0, 0.0, 1.0], |foot| {
                     let side = (foot.distance / tube.radius).min(1.0);
-                    [
-                        foot.across[0] * side,
-                        foot.across[1] * side,
-                        (1.0 - side * side).sqrt(),
-                    ]
+                    [foot.across[0] * side, foot.across[1] * side, (1.0 - side * side).sqrt()]
                 });
-                (tube.paint.at(hit.at), normal)
+                (tube.paint.at(hit.at, 20.0), normal)
             }
             Part::Top | Part::Wall | Part::Cut(_) => {
                 let layer = &self.layers[hit.layer];
                 let Some(near) = nearby.layers.iter().find(|n| n.index == hit.layer) else {
-                    return (layer.paint.at(hit.at), [0.0, 0.0, 1.0]);
+                    return (layer.paint.at(hit.at, 20.0), [0.0, 0.0, 1.0]);
                 };
                 let slope = |f: &dyn Fn(Xy) -> f32, step: f32| -> Xy {
                     let [x, y] = hit.at;
@@ -584,34 +774,43 @@ impl Prepared {
                         let g = slope(&|p| near.cutouts[c].shape.distance(p), 0.1);
                         unit([-g[0], -g[1], 0.02])
                     }
-                    _ if near.bumps.is_empty() && layer.edge_mm <= 0.0 => [0.0, 0.0, 1.0],
+                    _ if near.is_flat() => unit([-near.slow.slope[0], -near.slow.slope[1], 1.0]),
                     _ => {
                         let g = slope(&|p| near.rise(p), 0.15);
                         unit([-g[0], -g[1], 1.0])
                     }
                 };
-                (layer.paint.at(hit.at), normal)
+                let inset = if near.inside && near.edge_mm <= 0.0 && near.cutouts.is_empty() {
+                    20.0
+                } else {
+                    let openings = near.cutouts.iter().map(|c| c.shape.distance(hit.at));
+                    openings.fold(-layer.shape.distance(hit.at), f32::min).max(0.0)
+                };
+                let mut material = layer.paint.at(hit.at, inset);
+                if hit.part == Part::Top {
+                    for decal in &near.decals {
+                        decal.lay(hit.at, &mut material);
+                    }
+                }
+                (material, normal)
             }
         }
     }
 
     /// Share of the surroundings that reaches a point between higher sheets.
-    fn openness(&self, nearby: &Nearby, hit: &Hit, point: [f32; 3]) -> f32 {
+    fn openness(&self, shade: &Shade, hit: &Hit, point: [f32; 3]) -> f32 {
         let mut open = 1.0;
-        for near in &nearby.layers {
-            let above = near.layer.top_mm - point[2];
-            if above < 0.4 {
-                break;
-            }
-            if near.index == hit.layer && hit.part == Part::Wall {
+        for caster in &shade.open {
+            let above = caster.layer.top_mm - point[2];
+            if above < 0.4 || caster.index == hit.layer && matches!(hit.part, Part::Top | Part::Wall) {
                 continue;
             }
-            let outside = near.layer.shape.distance([point[0], point[1]]);
+            let outside = caster.layer.shape.distance([point[0], point[1]]);
             let reach = 0.45 * above.min(120.0) + 0.2;
             if outside >= 0.0 {
                 open *= 1.0 - 0.5 * (-outside / reach).exp();
             } else {
-                let gap = near.solid_distance([point[0], point[1]]).max(0.0);
+                let gap = caster.solid_distance([point[0], point[1]]).max(0.0);
                 open *= 1.0 - 0.8 * (-gap / reach).exp();
             }
         }
@@ -619,22 +818,29 @@ impl Prepared {
     }
 
     /// Share of a light that passes the sheets and tubes above a point.
-    fn lit(&self, nearby: &Nearby, hit: &Hit, point: [f32; 3], toward: [f32; 3], softness: f32) -> f32 {
+    fn lit(&self, shade: &Shade, light: usize, hit: &Hit, point: [f32; 3], toward: [f32; 3], softness: f32) -> f32 {
+        let (dark, casters) = &shade.lights[light];
+        if *dark {
+            return 0.0;
+        }
+        if casters.is_empty() && shade.segments[light].is_empty() {
+            return 1.0;
+        }
         let rise = toward[2].max(0.05);
         let along = [toward[0] / rise, toward[1] / rise];
         let mut lit = 1.0f32;
-        for near in &nearby.layers {
-            let above = near.layer.top_mm - point[2];
-            if above < 0.05 {
-                break;
+        for caster in casters {
+            let above = caster.layer.top_mm - point[2];
+            let own = caster.index == hit.layer && hit.part != Part::Tube;
+            if above < 0.05 || own && matches!(hit.part, Part::Top | Part::Wall) {
+                continue;
             }
-            let own = near.index == hit.layer;
-            let low = (above - near.layer.wall_mm).max(0.0);
+            let low = (above - caster.layer.wall_mm).max(0.0);
             let looks = if low < above - 2.0 && !own { 3 } else { 1 };
             for k in 0..looks {
                 let s = lerp(above, low, k as f32 / 2.0);
                 let p = [point[0] + s * along[0], point[1] + s * along[1]];
-                let d = near.solid_distance(p);
+                let d = caster.solid_distance(p);
                 let width = softness * s + 0.25;
                 lit = lit.min((0.5 + 0.5 * d / width).clamp(0.0, 1.0));
             }
@@ -642,7 +848,7 @@ impl Prepared {
                 return 0.0;
             }
         }
-        for &(t, s) in &nearby.segments {
+        for &(t, s) in &shade.segments[light] {
             let tube = &self.tubes[t];
             let (a, b) = (tube.points[s], tube.points[s + 1]);
             let mean = 0.5 * (a[2] + b[2]) - point[2];
@@ -654,7 +860,7 @@ impl Prepared {
             let foot = segment_foot(a, b, [point[0] + above * along[0], point[1] + above * along[1]]);
             let width = softness * above + 0.25;
             // A thin tube hides only its share of a wide light.
-            let share = (2.0 * tube.radius / (2.0 * width)).min(1.0);
+            let share = (tube.radius / width).min(1.0);
             let dark = (0.5 - 0.5 * (foot.distance - tube.radius) / width).clamp(0.0, 1.0);
             lit = lit.min(1.0 - share * dark);
         }
@@ -662,8 +868,8 @@ impl Prepared {
     }
 }
 
-/// Farthest sideways that a higher sheet is looked for when shadows fall, mm.
-const SHADOW_MM: f32 = 60.0;
+/// Below this nothing is drawn, mm.
+const FLOOR_MM: f32 = -2500.0;
 
 /// Height between `high` and `low` at which a distance changes from positive to negative, by bisection.
 fn crossing(high: f32, low: f32, distance: impl Fn(f32) -> f32) -> Option<f32> {
@@ -677,6 +883,12 @@ fn crossing(high: f32, low: f32, distance: impl Fn(f32) -> f32) -> Option<f32> {
         }
     }
     Some(inside)
+}
+
+/// Whether a place belongs to the item itself rather than to the sheet around it.
+fn solid_at(relief: &Relief, x: f32, y: f32) -> bool {
+    let cell = |v: f32| ((v + relief.half_mm()) / relief.texel_mm + 0.5).clamp(0.0, (relief.size - 1) as f32) as usize;
+    relief.solid[cell(y) * relief.size + cell(x)]
 }
 
 fn blend(under: &Material, over: &Material, cover: f32) -> Material {

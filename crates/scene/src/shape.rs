@@ -36,6 +36,11 @@ impl Bounds {
             high: [self.high[0] + by_mm, self.high[1] + by_mm],
         }
     }
+    /// Its middle, and how far its corners are from there.
+    pub fn middle(&self) -> (Xy, f32) {
+        let center = [0.5 * (self.low[0] + self.high[0]), 0.5 * (self.low[1] + self.high[1])];
+        (center, 0.5 * (self.high[0] - self.low[0]).hypot(self.high[1] - self.low[1]))
+    }
     pub fn meets(&self, other: &Bounds) -> bool {
         (0..2).all(|k| self.low[k] <= other.high[k] && other.low[k] <= self.high[k])
     }
@@ -263,7 +268,10 @@ mod tests {
                 assert!((shape.distance(q) - d).abs() <= 0.501, "{shape:?} at {p:?}");
                 if d < 0.0 {
                     let b = shape.bounds();
-                    assert!(b.meets(&Bounds::around(p, [0.0; 2])), "{shape:?} at {p:?} outside {b:?}");
+                    assert!(
+                        b.meets(&Bounds::around(p, [0.0; 2])),
+                        "{shape:?} at {p:?} outside {b:?}"
+                    );
                 }
             }
         }
