@@ -336,10 +336,12 @@ impl Way<'_> {
         }
         for (index, step) in program.steps.iter().enumerate().skip(self.record.steps_done) {
             self.observer.step(self.record.unit, index, program.steps.len(), &step.name);
-            if step.has_screws() {
-                self.screws(index, step, &step.present, Purpose::Work).await?;
-            }
-            if let Work::Cover { .. } = step.work {
+            // after a crash the cover of this step may be off already
+            let off = matches!(&step.work, Work::Cover { cover, .. } if self.record.covers_off().contains(&cover.as_str()));
+            if !off {
+                if step.has_screws() {
+                    self.screws(index, step, &step.present, Purpose::Work).await?;
+                }
                 self.cover(index, step).await?;
             }
             self.log(Event::StepDone { step: index })?;
