@@ -1,4 +1,5 @@
-//! Renders faces to look at: `cargo run --release -p scene --example face -- SEED FACE OUT.png [overlay]`.
+//! Renders faces to look at: `cargo run --release -p scene --example face -- SEED FACE OUT.png [overlay]`;
+//! with `crops` for FACE, a sheet of every screw (and, in red frames, every decoy) of units from SEED on, 48 px each, truth marked.
 
 use scene::{FaceId, FaceView, Prepared, Unit};
 use std::path::Path;
@@ -9,6 +10,9 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         return Err("usage: face SEED front|left|right|top|front_inner OUT.png [overlay]".into());
     };
     let seed: u64 = seed.parse()?;
+    if face == "crops" {
+        return crops(seed, Path::new(out), rest.iter().any(|a| a == "overlay"));
+    }
     let face = FaceId::ALL
         .into_iter()
         .find(|f| f.name() == face)
@@ -29,7 +33,13 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         let truth = prepared.truth();
         for screw in &truth.screws {
             let color = if screw.detectable { [0, 255, 0] } else { [255, 160, 0] };
-            ring(&mut picture, screw.pixel.u_px, screw.pixel.v_px, 0.7 * screw.head_d_px, color);
+            ring(
+                &mut picture,
+                screw.pixel.u_px,
+                screw.pixel.v_px,
+                0.7 * screw.head_d_px,
+                color,
+            );
             eprintln!(
                 "screw {} at {:.1} {:.1} d {:.1} px seen {:.2} slot {:.2} {:?}",
                 screw.id.0,
@@ -42,7 +52,13 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             );
         }
         for decoy in &truth.decoys {
-            ring(&mut picture, decoy.pixel.u_px, decoy.pixel.v_px, 0.7 * decoy.d_px, [255, 0, 0]);
+            ring(
+                &mut picture,
+                decoy.pixel.u_px,
+                decoy.pixel.v_px,
+                0.7 * decoy.d_px,
+                [255, 0, 0],
+            );
         }
     }
     geometry::write_png(Path::new(out), &picture)?;
@@ -59,4 +75,54 @@ fn ring(picture: &mut geometry::RgbImage, u: f64, v: f64, radius: f64, color: [u
             }
         }
     }
+}
+
+fn crops(first: u64, out: &Path, marked: bool) -> Result<(), Box<dyn std::error::Error>> {
+    const SIDE: u32 = 48;
+    const ZOOM: u32 = 2;
+    const COLUMNS: u32 = 16;
+    const ROWS: u32 = 10;
+    let tile = SIDE * ZOOM;
+    let mut sheet = geometry::RgbImage::new(COLUMNS * tile, ROWS * tile);
+    let mut k = 0;
+    let start = std::time::Instant::now();
+    'units: for seed in first.. {
+        let unit = Unit::sample(seed);
+        for face in FaceId::ALL {
+            let view = FaceView::sample(&unit, face, seed).ok_or("no such face")?;
+            let prepared = Prepared::new(&view);
+            let truth = prepared.truth();
+            let screws = truth.screws.iter().map(|s| (s.pixel, true));
+            let decoys = truth.decoys.iter().map(|d| (d.pixel, false));
+            for (pixel, screw) in screws.chain(decoys.take(2)) {
+                if k >= COLUMNS * ROWS {
+                    break 'units;
+                }
+                let roi = scene::Roi::around(&view.camera, pixel, SIDE);
+                let crop = prepared.render(Some(roi)).color;
+                let filter = image::imageops::FilterType::CatmullRom;
+                let mut big = image::imageops::resize(&crop, tile, tile, filter);
+                if marked && screw {
+                    let at = |p: f64, o: u32| ((p - f64::from(o) + 0.5) * f64::from(ZOOM)) as u32;
+                    let (u, v) = (at(pixel.u_px, roi.x_px), at(pixel.v_px, roi.y_px));
+                    if u < tile && v < tile {
+                        big.put_pixel(u, v, image::Rgb([0, 255, 0]));
+                    }
+                }
+                for x in 0..tile {
+                    big.put_pixel(x, 0, image::Rgb(if screw { [0, 0, 0] } else { [255, 0, 0] }));
+                }
+                image::imageops::replace(
+                    &mut sheet,
+                    &big,
+                    i64::from(k % COLUMNS * tile),
+                    i64::from(k / COLUMNS * tile),
+                );
+                k += 1;
+            }
+        }
+    }
+    eprintln!("{k} regions in {:.2} s", start.elapsed().as_secs_f64());
+    geometry::write_png(out, &sheet)?;
+    Ok(())
 }

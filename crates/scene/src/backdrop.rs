@@ -36,7 +36,7 @@ pub(crate) fn surround(sheetwork: &mut Sheetwork, design: &FaceDesign, rng: &mut
         gray(level, rng)
     };
     let mud = gray(0.1, rng);
-    let paint = Paint::new(coat, color, rough, rng).worn(rng.random_range(0.1..0.8), mud, 0.0, rng);
+    let paint = Paint::new(coat, color, rough, rng).worn(rng.random_range(0.05..0.45), mud, 0.0, rng);
     let mut wall = Layer::new(Shape::rect([0.0; 2], [6000.0; 2], 0.0), back, 0.0, 0.0, paint);
     // joints of tiles, boards or plates; T-slots of a table
     if rng.random_bool(0.6) {

@@ -160,7 +160,7 @@ impl Bump {
                     return 0.0;
                 }
                 let phase = (dy + half[1]) / pitch;
-                let f = phase - phase.floor();
+                let f = phase - phase as i32 as f32;
                 // rises slowly, falls off at the slot
                 let rise = (f / 0.72).min((0.95 - f) / 0.08).clamp(0.0, 1.0);
                 let ends = (across / (0.6 * pitch)).min(1.0);

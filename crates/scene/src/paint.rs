@@ -60,7 +60,7 @@ fn mix(a: [f32; 3], b: [f32; 3], t: f32) -> [f32; 3] {
 
 impl Paint {
     pub fn new<R: RngExt + ?Sized>(coat: Coat, albedo: [f32; 3], roughness: f32, rng: &mut R) -> Self {
-        let feature_mm = rng.random_range(110.0..240.0);
+        let feature_mm = rng.random_range(110.0..240.0) * if coat == Coat::Mineral { 2.5 } else { 1.0 };
         Self {
             coat,
             albedo,
@@ -110,7 +110,7 @@ impl Paint {
             Coat::Plastic => 1.0 + 0.04 * (cloud - 0.5),
             Coat::Zinc => {
                 // spangle: crystals that shine differently
-                let crystal = (fine * 6.0).floor() / 6.0;
+                let crystal = (fine * 6.0) as u32 as f32 / 6.0;
                 out.roughness = (out.roughness + 0.07 * (crystal - 0.4)).clamp(0.15, 0.9);
                 1.0 + 0.06 * (crystal - 0.5) + 0.12 * (cloud - 0.5)
             }
@@ -124,9 +124,9 @@ impl Paint {
             let gradient = ((y - self.fall[0]) / self.fall[1]).clamp(-0.6, 1.0);
             let film = 0.35 * self.dirt * smoothstep(0.25, 0.95, cloud + 0.45 * gradient) + edge * (0.4 + 0.6 * fine);
             let amount = self.dirt * (1.0 + 0.8 * gradient);
-            let spots = smoothstep(0.9 - 0.24 * amount, 1.06 - 0.22 * amount, patch) * (0.6 + 0.4 * fine);
+            let spots = smoothstep(0.84 - 0.24 * amount, 1.1 - 0.2 * amount, patch) * (0.75 + 0.25 * fine);
             let specks = 0.6 * smoothstep(0.985 - 0.03 * amount, 1.0, fine) * smoothstep(0.3, 0.7, cloud);
-            let cover = (film + 0.75 * spots + self.dirt * specks).min(0.92);
+            let cover = (film + 0.62 * spots + self.dirt * specks).min(0.92);
             out.albedo = mix(out.albedo, self.soil, cover);
             out.roughness += cover * (0.9 - out.roughness);
             out.metallic *= 1.0 - cover;

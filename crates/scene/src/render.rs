@@ -328,7 +328,14 @@ impl Prepared {
         for hit in &hits {
             heights = (heights.0.min(hit.height), heights.1.max(hit.height));
         }
-        let shade = self.shade(&rays, heights, !nearby.spots.is_empty());
+        // sheets seen in this block: their own grooves are not in their shadow
+        let mut seen: Vec<usize> = Vec::new();
+        for hit in &hits {
+            if matches!(hit.part, Part::Top | Part::Wall) && !seen.contains(&hit.layer) {
+                seen.push(hit.layer);
+            }
+        }
+        let shade = self.shade(&rays, heights, &seen, !nearby.spots.is_empty());
         for y in 0..BLOCK {
             for x in 0..BLOCK {
                 let i = (y + 1) * WIDE + x + 1;
@@ -476,7 +483,7 @@ impl Prepared {
     }
 
     /// What keeps light from the places of a block that lie between two heights.
-    fn shade(&self, rays: &Rays, heights: (f32, f32), items: bool) -> Shade<'_> {
+    fn shade(&self, rays: &Rays, heights: (f32, f32), seen: &[usize], items: bool) -> Shade<'_> {
         let (low, high) = if items {
             (heights.0 - 6.0, heights.1 + 8.0)
         } else {
@@ -522,7 +529,7 @@ impl Prepared {
                 }
                 let caster = caster(index, &region);
                 // wholly in the umbra; never for what may be the sheet itself
-                if layer.top_mm > high + 0.5 && caster.solid_distance(far) < -width {
+                if layer.top_mm > high + 0.5 && !seen.contains(&index) && caster.solid_distance(far) < -width {
                     dark = true;
                     break;
                 }
@@ -783,10 +790,16 @@ impl Prepared {
                 let inset = if near.inside && near.edge_mm <= 0.0 && near.cutouts.is_empty() {
                     20.0
                 } else {
+                    // a rim of a wall is as exposed as that of the sheet
                     let openings = near.cutouts.iter().map(|c| c.shape.distance(hit.at));
                     openings.fold(-layer.shape.distance(hit.at), f32::min).max(0.0)
                 };
-                let mut material = layer.paint.at(hit.at, inset);
+                // on a wall the texture runs along it and down
+                let place = match hit.part {
+                    Part::Top => hit.at,
+                    _ => [hit.at[0] * normal[1].abs() + hit.at[1] * normal[0].abs(), -hit.height],
+                };
+                let mut material = layer.paint.at(place, inset);
                 if hit.part == Part::Top {
                     for decal in &near.decals {
                         decal.lay(hit.at, &mut material);

@@ -3,6 +3,7 @@
 //! Every pixel depends on its own place in the whole picture only, so that a region has the pixels of the whole.
 
 use crate::render::{BLOCK, Block, Prepared, Rendered};
+use crate::shape::nearest;
 use crate::view::Roi;
 use geometry::{DepthMap, RgbImage};
 use rand::{RngExt, SeedableRng};
@@ -337,7 +338,7 @@ impl<'a> Development<'a> {
                 let electrons = light.max(0.0) * s.full_well;
                 let noise = normal(hash(s.noise_seed, x, y)) * (electrons + s.read_noise * s.read_noise).sqrt();
                 let counted = ((electrons + noise) / s.full_well).clamp(-0.02, 1.0);
-                raw[row * rw + column] = (counted * 4095.0).round() * (1.0 / 4095.0) / SENSITIVITY[channel];
+                raw[row * rw + column] = nearest(counted * 4095.0) * (1.0 / 4095.0) / SENSITIVITY[channel];
             }
         }
         // colours at every pixel (Malvar, He, Cutler 2004), balanced and toned
@@ -560,7 +561,8 @@ impl DepthEye<'_> {
 
 /// Smooth noise over the plane, 0 to 1, knots one apart.
 fn smooth_noise(seed: u64, x: f32, y: f32) -> f32 {
-    let (ix, iy) = (x.floor(), y.floor());
+    // places are not negative
+    let (ix, iy) = (x as i32 as f32, y as i32 as f32);
     let ease = |t: f32| t * t * (3.0 - 2.0 * t);
     let (fx, fy) = (ease(x - ix), ease(y - iy));
     let knot = |dx: i64, dy: i64| share(hash(seed, ix as i64 + dx, iy as i64 + dy));
