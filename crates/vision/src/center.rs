@@ -13,8 +13,6 @@ use serde::{Deserialize, Serialize};
 use crate::Corrections;
 use crate::picture::Patch;
 
-/// A recess is not exactly in the middle of its head: the circle's centre is never surer than this about it, px at 28 px heads.
-const ECCENTRICITY: f64 = 0.6 / 28.0;
 /// Cues that differ by more than so many sigmas are not of the same thing.
 const GATE_SIGMAS: f64 = 3.5;
 
@@ -90,7 +88,7 @@ struct Edge {
 /// # Returns
 /// `None` where less than 40 % of an outline is there.
 pub fn outer_circle(picture: &RgbImage, start: Pixel, diameter_px: f64) -> Option<Circle> {
-    let plain = patch(picture, start, diameter_px, 0.035)?;
+    let plain = patch(picture, start, diameter_px, 0.85, 0.035)?;
     let equalised = plain.clone().equalised();
     let radius = 0.5 * diameter_px;
     let local = plain.local(start);
@@ -122,12 +120,12 @@ pub fn outer_circle(picture: &RgbImage, start: Pixel, diameter_px: f64) -> Optio
     })
 }
 
-fn patch(picture: &RgbImage, at: Pixel, diameter_px: f64, blur: f64) -> Option<Patch> {
+fn patch(picture: &RgbImage, at: Pixel, diameter_px: f64, half: f64, blur: f64) -> Option<Patch> {
     let inside = (-0.5..f64::from(picture.width())).contains(&at.u_px)
         && (-0.5..f64::from(picture.height())).contains(&at.v_px)
         && (6.0..2000.0).contains(&diameter_px);
     inside.then(|| {
-        Patch::cut(picture, at, (0.85 * diameter_px).ceil() as usize + 3).blurred((blur * diameter_px).max(0.5))
+        Patch::cut(picture, at, (half * diameter_px).ceil() as usize + 3).blurred((blur * diameter_px).max(0.5))
     })
 }
 
@@ -320,8 +318,11 @@ pub(crate) fn fit_harmonics(points: &[(f64, f64, f64)], rays: usize, radius: f64
 
 /// Angles and rings of the polar sampling on which the cross is matched; a quarter turn is a whole number of angles.
 const ANGLES: usize = 64;
-/// The recess and a little of the head's top around it, in head diameters.
-const RECESS: std::ops::Range<f64> = 0.05..0.36;
+/// The recess, in head diameters.
+const RECESS: std::ops::Range<f64> = 0.04..0.28;
+
+/// How much grey and edges count: edges alone lock on rust and scratches, grey alone on shadows.
+const LAYER_WEIGHTS: [f64; 2] = [0.8, 0.2];
 
 /// Polar pattern of the recess around a trial centre.
 struct Pattern<'a> {
@@ -331,13 +332,13 @@ struct Pattern<'a> {
 }
 
 impl Pattern<'_> {
-    /// Share of the pattern's angular variance that repeats every quarter turn, mean of grey and edges.
+    /// Share of the pattern's angular variance that repeats every quarter turn, over grey and edges.
     ///
     /// Ring means are taken out first: a dome or a concentric ring says nothing about a cross.
     fn symmetry(&self, [x, y]: [f64; 2]) -> f64 {
         const QUARTER: usize = ANGLES / 4;
         let mut score = 0.0;
-        for patch in self.layers {
+        for (patch, weight) in self.layers.into_iter().zip(LAYER_WEIGHTS) {
             let (mut repeated, mut total) = (0.0, 1e-9);
             for &r in &self.radii {
                 let mut ring = [0f64; ANGLES];
@@ -352,7 +353,7 @@ impl Pattern<'_> {
                     total += r * four.iter().map(|v| (v - mean).powi(2)).sum::<f64>();
                 }
             }
-            score += 0.5 * repeated / total;
+            score += weight * repeated / total;
         }
         score
     }
@@ -380,7 +381,7 @@ impl Pattern<'_> {
 /// * `start` – the centre so far, good to about 0.15 diameters.
 /// * `diameter_px` – of the head, good to about 25 %.
 pub fn cross(picture: &RgbImage, start: Pixel, diameter_px: f64) -> Option<Cross> {
-    let grey = patch(picture, start, diameter_px, 0.02)?.equalised();
+    let grey = patch(picture, start, diameter_px, 0.6, 0.03)?.equalised();
     let edges = grey.gradient();
     let step = (diameter_px / 37.0).max(0.5);
     let rings = ((RECESS.end - RECESS.start) * diameter_px / step).ceil().max(4.0);
@@ -425,8 +426,9 @@ pub fn cross(picture: &RgbImage, start: Pixel, diameter_px: f64) -> Option<Cross
     if symmetry < MIN_SYMMETRY || off > 0.2 * diameter_px {
         return None;
     }
-    // Least squares: variance = 2 * residual / (samples * curvature), about 4 px² to an independent sample.
-    let samples = 0.5 * TAU * (RECESS.end * diameter_px).powi(2) / 4.0;
+    // Least squares: variance = 2 * residual / (samples * curvature), about 9 px² to an independent sample
+    // (what makes the stated errors true on rendered faces).
+    let samples = 0.5 * TAU * (RECESS.end * diameter_px).powi(2) / 9.0;
     let sigma_px = (2.0 * (1.0 - share) / (samples * curvature)).sqrt();
     Some(Cross {
         center: CueCenter {
@@ -439,7 +441,7 @@ pub fn cross(picture: &RgbImage, start: Pixel, diameter_px: f64) -> Option<Cross
 }
 
 /// Below this the recess is buried, worn off, or no cross.
-const MIN_SYMMETRY: f64 = 0.2;
+const MIN_SYMMETRY: f64 = 0.12;
 
 struct Peak {
     dx: f64,
@@ -494,7 +496,7 @@ pub fn fuse(
     held.extend(learned.map(|c| (Cue::Learned, scaled(c, corrections.learned_sigma))));
     held.extend(circle.map(|c| {
         let mut center = scaled(c.center, corrections.circle_sigma);
-        center.sigma_px = center.sigma_px.hypot(ECCENTRICITY * c.diameter_px);
+        center.sigma_px = center.sigma_px.hypot(corrections.eccentricity * c.diameter_px);
         (Cue::Circle, center)
     }));
     held.extend(cross.map(|c| (Cue::Cross, scaled(c.center, corrections.cross_sigma))));

@@ -6,7 +6,9 @@ use nalgebra::Vector3;
 use crate::Corrections;
 
 /// The ring of the head's top around the recess, in head diameters: what lies inside is biased by the slot's floor.
-const TOP_RING: [f64; 2] = [0.28, 0.45];
+const TOP_RING: [f64; 2] = [0.24, 0.36];
+/// Height of the rim above that ring, in head diameters, and its spread: most heads are a little domed.
+const DOME: [f64; 2] = [0.02, 0.015];
 /// The ring of sheet around the head, in head diameters.
 const SHEET_RING: [f64; 2] = [0.75, 1.6];
 /// Height of the recess rim above the sheet, in head diameters, and its spread: pan, truss, binding, washer and flange heads.
@@ -15,9 +17,6 @@ const RIM_HEIGHT: [f64; 2] = [0.27, 0.09];
 const STEEPEST: f64 = 1.0;
 /// Stereo errors of neighbouring measurements go together: so many count as one.
 const MEASUREMENTS_A_SAMPLE: f64 = 4.0;
-/// Depth errors that no number of measurements averages out, mm.
-const DEPTH_FLOOR_MM: f64 = 0.05;
-
 /// What a depth rests on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum DepthSource {
@@ -64,26 +63,21 @@ pub fn locate(
             .filter(|plane| believable(plane, camera, pixel))
     };
     let noise = |plane: &SurfaceSample| plane.sigma_mm * MEASUREMENTS_A_SAMPLE.sqrt();
-    let sheet = || {
-        let plane = ring(SHEET_RING)?;
+    // Depth of the rim from that of a ring's plane: (rise, spread) in head diameters, along the normal.
+    let rim = |plane: SurfaceSample, [rise, spread]: [f64; 2], source| {
         let head_mm = diameter_px * camera.pixel_mm(plane.depth_mm);
         let normal = normal(&plane, camera, pixel)?;
-        // Along the normal, as far as the ray's depth is concerned.
-        let rise = RIM_HEIGHT[0] * head_mm * normal.vector().z.abs();
-        Some((
-            plane,
-            plane.depth_mm - rise,
-            RIM_HEIGHT[1] * head_mm,
-            DepthSource::Sheet,
-        ))
+        let depth_mm = plane.depth_mm - rise * head_mm * normal.vector().z.abs();
+        Some((plane, depth_mm, spread * head_mm, normal, source))
     };
-    let top = ring(TOP_RING).map(|plane| (plane, plane.depth_mm, DEPTH_FLOOR_MM, DepthSource::Head));
-    let (plane, depth_mm, spread_mm, source) = top.or_else(sheet)?;
+    let top = || rim(ring(TOP_RING)?, DOME, DepthSource::Head);
+    let sheet = || rim(ring(SHEET_RING)?, RIM_HEIGHT, DepthSource::Sheet);
+    let (plane, depth_mm, spread_mm, normal, source) = top().or_else(sheet)?;
     Some(Located {
         point: camera.unproject(pixel, depth_mm),
         sigma_depth_mm: noise(&plane).hypot(spread_mm) * corrections.depth_sigma,
         sigma_lateral_mm: sigma_px * camera.pixel_mm(depth_mm),
-        normal: normal(&plane, camera, pixel)?,
+        normal,
         source,
     })
 }
@@ -130,7 +124,7 @@ mod tests {
             for i in 0..width {
                 let p = map.color_pixel(i, j);
                 let r = p.distance_px(&AT) / DIAMETER_PX;
-                let relief = if r < 0.25 {
+                let relief = if r < 0.23 {
                     2.0
                 } else if r < 0.5 {
                     0.0

@@ -143,7 +143,11 @@ pub fn find_marker(picture: &RgbImage, spec: &MarkerSpec) -> Result<Marker, Mark
     blobs.sort_by(|a, b| b.diameter_px.total_cmp(&a.diameter_px));
     // A little outside the limits still counts as a disc, so that its size can be told.
     let near = |b: &&Blob| (0.8 * least_px..1.25 * most_px).contains(&b.diameter_px);
-    let discs: Vec<&Blob> = blobs.iter().filter(|b| b.roundness > MIN_ROUNDNESS).filter(near).collect();
+    let discs: Vec<&Blob> = blobs
+        .iter()
+        .filter(|b| b.roundness > MIN_ROUNDNESS)
+        .filter(near)
+        .collect();
     let disc = match discs[..] {
         [disc] => disc,
         [] => {

@@ -55,6 +55,9 @@ impl Default for Thresholds {
 pub struct Corrections {
     /// True error over stated sigma of the outer circle's centre.
     pub circle_sigma: f64,
+    /// How far a head's outline may be off its recess, standard deviation along each axis in head diameters: eccentric recesses,
+    /// washers, and the parallax between the rim and the outline below it. The circle is never surer than this.
+    pub eccentricity: f64,
     /// True error over stated sigma of the cross's centre.
     pub cross_sigma: f64,
     /// True error over stated sigma of the learned centre.
@@ -73,6 +76,7 @@ impl Default for Corrections {
     fn default() -> Self {
         Self {
             circle_sigma: 1.0,
+            eccentricity: 0.04,
             cross_sigma: 1.0,
             learned_sigma: 1.0,
             fused_sigma: 1.0,
