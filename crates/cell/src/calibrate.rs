@@ -128,7 +128,9 @@ pub async fn capture_pairs(
             visit: target.id,
             source,
         };
-        let (pair, miss) = visit(devices, &mover, target, settings, &pairs).await.map_err(stopped)?;
+        let (pair, miss) = visit(devices, &mover, target, settings, &pairs)
+            .await
+            .map_err(stopped)?;
         writer.append(&pair)?;
         pairs.push(pair);
         let go_on = pairs.last().is_none_or(|pair| {
@@ -217,7 +219,10 @@ async fn find(
 /// Where the camera should see a commanded place, by the rigid motion that fits the rows so far. Only to know where to look.
 fn predict(command: Point<Base>, before: &[Pair]) -> Option<Point<Camera>> {
     // the latest rows are the nearest ones
-    let rows = before.iter().rev().filter_map(|p| Some((p.command.vector(), p.camera?.vector())));
+    let rows = before
+        .iter()
+        .rev()
+        .filter_map(|p| Some((p.command.vector(), p.camera?.vector())));
     let (from, to): (Vec<_>, Vec<_>) = rows.take(60).unzip();
     if from.len() < 4 {
         return None;
@@ -245,10 +250,8 @@ mod tests {
 
     #[test]
     fn places_are_predicted_from_a_plane_of_rows() {
-        let camera_from_base: Transform<Camera, Base> = Transform::from_parts(
-            [12.0, 530.0, -300.0],
-            UnitQuaternion::from_euler_angles(1.5, 0.1, -1.6),
-        );
+        let camera_from_base: Transform<Camera, Base> =
+            Transform::from_parts([12.0, 530.0, -300.0], UnitQuaternion::from_euler_angles(1.5, 0.1, -1.6));
         let rows: Vec<Pair> = (0..12)
             .map(|n| {
                 let command = Point::new(1000.0, 50.0 * f64::from(n % 4), 300.0 + 50.0 * f64::from(n / 4));

@@ -95,7 +95,9 @@ pub async fn shoot(devices: &Devices, region: Option<Region>, depth_frames: usiz
 
 fn check_registered(color: &ColorFrame, depth: &DepthFrame) -> Result<(), DeviceError> {
     let (width, height) = color.image.dimensions();
-    if depth.region == color.region && DepthMap::step_between((width, height), (depth.map.width, depth.map.height)) == Some(depth.map.step) {
+    if depth.region == color.region
+        && DepthMap::step_between((width, height), (depth.map.width, depth.map.height)) == Some(depth.map.step)
+    {
         return Ok(());
     }
     Err(DeviceError::Fault {
@@ -181,7 +183,10 @@ const PICTURE_COST_MPX: f64 = 1.0;
 
 /// Few regions that together show everything around some pixels: two are joined where one picture costs less than two.
 pub fn regions_around(camera: &CameraModel, pixels: &[Pixel], half_px: f64) -> Vec<Region> {
-    let mut regions: Vec<Region> = pixels.iter().filter_map(|p| region_around(camera, *p, half_px)).collect();
+    let mut regions: Vec<Region> = pixels
+        .iter()
+        .filter_map(|p| region_around(camera, *p, half_px))
+        .collect();
     let cost = |r: &Region| PICTURE_COST_MPX + f64::from(r.width_px) * f64::from(r.height_px) * 1e-6;
     loop {
         let mut best: Option<(f64, usize, usize, Region)> = None;
@@ -242,7 +247,8 @@ impl FaceFit {
             depth_mm: inverse,
         };
         let axis = Pixel::new(camera.cx_px, camera.cy_px);
-        let reach_px = f64::from(camera.width_px).hypot(f64::from(camera.height_px)) + axis.u_px.abs() + axis.v_px.abs();
+        let reach_px =
+            f64::from(camera.width_px).hypot(f64::from(camera.height_px)) + axis.u_px.abs() + axis.v_px.abs();
         let plane = map.plane_at(axis, 0.0, reach_px)?;
         let at_axis = plane.depth_mm;
         (at_axis > 0.0 && plane.inliers >= 100).then_some(Self {
@@ -286,7 +292,9 @@ pub fn sheet_normal(frame: &RgbdFrame, pixel: Pixel, diameter_px: f64) -> Option
     }
     let at = |du: f64, dv: f64| {
         let z = plane.depth_mm + plane.slope_mm_per_px[0] * du + plane.slope_mm_per_px[1] * dv;
-        camera.unproject(Pixel::new(pixel.u_px + du, pixel.v_px + dv), z).vector()
+        camera
+            .unproject(Pixel::new(pixel.u_px + du, pixel.v_px + dv), z)
+            .vector()
     };
     let middle = at(0.0, 0.0);
     let normal = (at(4.0, 0.0) - middle).cross(&(at(0.0, 4.0) - middle));
@@ -320,7 +328,13 @@ mod tests {
                 let z = 1500.0 * normal.z / (normal.x * x + normal.y * y + normal.z);
                 let inside = (60..340).contains(&i) && (40..260).contains(&j);
                 let hole = (i * 7 + j * 3) % 11 == 0;
-                map.depth_mm[(j * width + i) as usize] = if hole { 0.0 } else if inside { z as f32 } else { 1800.0 };
+                map.depth_mm[(j * width + i) as usize] = if hole {
+                    0.0
+                } else if inside {
+                    z as f32
+                } else {
+                    1800.0
+                };
             }
         }
         RgbdFrame {
@@ -379,6 +393,9 @@ mod tests {
                 && p.u_px + 90.0 <= f64::from(r.x_px + r.width_px)
                 && p.v_px + 90.0 <= f64::from(r.y_px + r.height_px)
         };
-        assert!(pixels.iter().all(|p| regions.iter().any(|r| shown(p, r))), "{regions:?}");
+        assert!(
+            pixels.iter().all(|p| regions.iter().any(|r| shown(p, r))),
+            "{regions:?}"
+        );
     }
 }

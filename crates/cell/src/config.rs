@@ -303,27 +303,69 @@ impl CellConfig {
         let drive = &self.drive;
         for program in [drive.first, drive.after_cam_out, drive.after_seized] {
             within("drive.*.max_time_s", program.max_time_s, 0.1, 15.0, "0.1 to 15 s")?;
-            within("drive.*.max_torque_nm", program.max_torque_nm, 0.5, 40.0, "0.5 to 40 N m")?;
-            within("drive.*.axial_force_n", program.axial_force_n, 10.0, 500.0, "10 to 500 N")?;
+            within(
+                "drive.*.max_torque_nm",
+                program.max_torque_nm,
+                0.5,
+                40.0,
+                "0.5 to 40 N m",
+            )?;
+            within(
+                "drive.*.axial_force_n",
+                program.axial_force_n,
+                10.0,
+                500.0,
+                "10 to 500 N",
+            )?;
             within("drive.*.stroke_mm", program.stroke_mm, 1.0, 60.0, "1 to 60 mm")?;
         }
         let approach = &self.approach;
         within("approach.standoff_mm", approach.standoff_mm, 10.0, 60.0, "10 to 60 mm")?;
-        within("approach.approach_mm_s", approach.approach_mm_s, 1.0, 500.0, "1 to 500 mm/s")?;
-        within("approach.retract_mm_s", approach.retract_mm_s, 1.0, 1500.0, "1 to 1500 mm/s")?;
+        within(
+            "approach.approach_mm_s",
+            approach.approach_mm_s,
+            1.0,
+            500.0,
+            "1 to 500 mm/s",
+        )?;
+        within(
+            "approach.retract_mm_s",
+            approach.retract_mm_s,
+            1.0,
+            1500.0,
+            "1 to 1500 mm/s",
+        )?;
         let [near, far] = self.inspection.working_depth_mm;
-        within("inspection.working_depth_mm[0]", near, 1.0, far, "nearer than the far end")?;
+        within(
+            "inspection.working_depth_mm[0]",
+            near,
+            1.0,
+            far,
+            "nearer than the far end",
+        )?;
         let tilt = self.exclusion.screw_tilt_max_rad;
         within("exclusion.screw_tilt_max_rad", tilt, 0.0, 0.5, "at most 0.5 rad")?;
         let quality = f64::from(self.journal.jpeg_quality);
         within("journal.jpeg_quality", quality, 1.0, 100.0, "1 to 100")?;
         let times = &self.timeouts;
-        let all = [times.load_s, times.present_s, times.move_s, times.job_s, times.discharge_s];
+        let all = [
+            times.load_s,
+            times.present_s,
+            times.move_s,
+            times.job_s,
+            times.discharge_s,
+        ];
         for time_s in all {
             within("timeouts.*", time_s, 0.1, 86_400.0, "0.1 s to a day")?;
         }
         within("timeouts.state_age_s", times.state_age_s, 0.01, 5.0, "0.01 to 5 s")?;
-        within("inspection.depth_frames", self.inspection.depth_frames as f64, 1.0, 16.0, "1 to 16")
+        within(
+            "inspection.depth_frames",
+            self.inspection.depth_frames as f64,
+            1.0,
+            16.0,
+            "1 to 16",
+        )
     }
 }
 
@@ -346,7 +388,10 @@ mod tests {
     #[test]
     fn the_example_says_what_the_defaults_are() {
         let text = include_str!("../cells/simulated.toml");
-        assert_eq!(CellConfig::parse(text, "simulated.toml").expect("parsed"), CellConfig::simulated());
+        assert_eq!(
+            CellConfig::parse(text, "simulated.toml").expect("parsed"),
+            CellConfig::simulated()
+        );
     }
 
     #[test]
@@ -357,7 +402,10 @@ mod tests {
         assert!(error.contains("c.toml") && error.contains("axial"), "{error}");
         let text = "name = 'x'\nbackend = 'simulated'\n[approach]\nstandoff_mm = 400.0";
         let error = CellConfig::parse(text, "c.toml").expect_err("unsafe").to_string();
-        assert!(error.contains("approach.standoff_mm") && error.contains("10 to 60"), "{error}");
+        assert!(
+            error.contains("approach.standoff_mm") && error.contains("10 to 60"),
+            "{error}"
+        );
         let error = CellConfig::parse("name = 'x'\nbackend = 'hses'", "c.toml")
             .expect_err("backend")
             .to_string();

@@ -50,7 +50,9 @@ pub enum JournalError {
         advice: &'static str,
     },
     /// Made by another version.
-    #[error("the journal {path} has format {found}, this program reads {SCHEMA_VERSION}; use the version that wrote it")]
+    #[error(
+        "the journal {path} has format {found}, this program reads {SCHEMA_VERSION}; use the version that wrote it"
+    )]
     Version {
         /// File.
         path: PathBuf,
@@ -92,12 +94,17 @@ fn advice(source: &rusqlite::Error) -> &'static str {
     }
 }
 
+/// Where a picture of a run lies.
+pub fn picture_path(folder: &Path, id: &PictureId) -> PathBuf {
+    folder.join(PICTURE_FOLDER).join(format!("{}.jpg", id.0))
+}
+
 /// The journal of a run.
 #[derive(Debug)]
 pub struct Journal {
     connection: Connection,
     path: PathBuf,
-    pictures: PathBuf,
+    folder: PathBuf,
 }
 
 impl Journal {
@@ -111,11 +118,14 @@ impl Journal {
             path: pictures.clone(),
             source,
         })?;
-        Self::connect(folder, OpenFlags::SQLITE_OPEN_READ_WRITE | OpenFlags::SQLITE_OPEN_CREATE, |connection| {
-            connection.pragma_update(None, "journal_mode", "WAL")?;
-            connection.pragma_update(None, "synchronous", "FULL")?;
-            connection.pragma_update(None, "foreign_keys", true)?;
-            connection.execute_batch(
+        Self::connect(
+            folder,
+            OpenFlags::SQLITE_OPEN_READ_WRITE | OpenFlags::SQLITE_OPEN_CREATE,
+            |connection| {
+                connection.pragma_update(None, "journal_mode", "WAL")?;
+                connection.pragma_update(None, "synchronous", "FULL")?;
+                connection.pragma_update(None, "foreign_keys", true)?;
+                connection.execute_batch(
                 "BEGIN IMMEDIATE;
                  CREATE TABLE IF NOT EXISTS units (
                      id INTEGER PRIMARY KEY, started_s REAL NOT NULL, outcome TEXT, record TEXT);
@@ -127,12 +137,13 @@ impl Journal {
                      sha256 TEXT PRIMARY KEY, width_px INTEGER NOT NULL, height_px INTEGER NOT NULL, bytes INTEGER NOT NULL);
                  COMMIT;",
             )?;
-            let version: i64 = connection.pragma_query_value(None, "user_version", |row| row.get(0))?;
-            if version == 0 {
-                connection.pragma_update(None, "user_version", SCHEMA_VERSION)?;
-            }
-            Ok(())
-        })
+                let version: i64 = connection.pragma_query_value(None, "user_version", |row| row.get(0))?;
+                if version == 0 {
+                    connection.pragma_update(None, "user_version", SCHEMA_VERSION)?;
+                }
+                Ok(())
+            },
+        )
     }
 
     /// Opens the journal of an earlier run, to read it only.
@@ -163,7 +174,7 @@ impl Journal {
         }
         Ok(Self {
             connection,
-            pictures: folder.join(PICTURE_FOLDER),
+            folder: folder.into(),
             path,
         })
     }
@@ -221,13 +232,17 @@ impl Journal {
         let mut bytes = Cursor::new(Vec::new());
         image::codecs::jpeg::JpegEncoder::new_with_quality(&mut bytes, jpeg_quality)
             .encode_image(picture)
-            .map_err(|e| bad(&self.pictures, e.to_string()))?;
+            .map_err(|e| bad(&self.folder, e.to_string()))?;
         let bytes = bytes.into_inner();
-        let id = PictureId(Sha256::digest(&bytes).iter().fold(String::with_capacity(64), |mut hex, byte| {
-            // writing to a string cannot fail
-            let _ = write!(hex, "{byte:02x}");
-            hex
-        }));
+        let id = PictureId(
+            Sha256::digest(&bytes)
+                .iter()
+                .fold(String::with_capacity(64), |mut hex, byte| {
+                    // writing to a string cannot fail
+                    let _ = write!(hex, "{byte:02x}");
+                    hex
+                }),
+        );
         let path = self.picture_path(&id);
         if !path.exists() {
             geometry::write_aside(&path, &bytes).map_err(|e| bad(&path, e.to_string()))?;
@@ -247,7 +262,7 @@ impl Journal {
 
     /// Where a picture lies.
     pub fn picture_path(&self, id: &PictureId) -> PathBuf {
-        self.pictures.join(format!("{}.jpg", id.0))
+        picture_path(&self.folder, id)
     }
 
     /// Events of a unit in order, with their times.
@@ -279,7 +294,11 @@ impl Journal {
     pub fn unit(&self, unit: u64) -> Result<Option<UnitRecord>, JournalError> {
         let started: Option<f64> = self
             .connection
-            .query_row("SELECT started_s FROM units WHERE id = ?1", [unit.cast_signed()], |row| row.get(0))
+            .query_row(
+                "SELECT started_s FROM units WHERE id = ?1",
+                [unit.cast_signed()],
+                |row| row.get(0),
+            )
             .optional()
             .map_err(|e| self.failed("read", e))?;
         let Some(started_s) = started else { return Ok(None) };
@@ -299,7 +318,9 @@ impl Journal {
     /// # Errors
     /// [`JournalError::Database`].
     pub fn unfinished(&self) -> Result<Option<u64>, JournalError> {
-        Ok(self.numbers("SELECT id FROM units WHERE record IS NULL ORDER BY id DESC LIMIT 1")?.pop())
+        Ok(self
+            .numbers("SELECT id FROM units WHERE record IS NULL ORDER BY id DESC LIMIT 1")?
+            .pop())
     }
 
     /// Records of all units in order, rebuilt from their events.
@@ -308,13 +329,20 @@ impl Journal {
     /// [`JournalError::Database`] or [`JournalError::Entry`].
     pub fn records(&self) -> Result<Vec<UnitRecord>, JournalError> {
         let units = self.units()?;
-        units.into_iter().filter_map(|unit| self.unit(unit).transpose()).collect()
+        units
+            .into_iter()
+            .filter_map(|unit| self.unit(unit).transpose())
+            .collect()
     }
 
     fn numbers(&self, query: &str) -> Result<Vec<u64>, JournalError> {
         self.connection
             .prepare(query)
-            .and_then(|mut select| select.query_map([], |row| row.get::<_, i64>(0).map(i64::unsigned_abs))?.collect())
+            .and_then(|mut select| {
+                select
+                    .query_map([], |row| row.get::<_, i64>(0).map(i64::unsigned_abs))?
+                    .collect()
+            })
             .map_err(|e| self.failed("read", e))
     }
 
@@ -404,7 +432,10 @@ mod tests {
         let bytes = fs::read(journal.picture_path(&a)).expect("picture");
         let hash: String = Sha256::digest(&bytes).iter().map(|b| format!("{b:02x}")).collect();
         assert_eq!(hash, a.0);
-        assert_eq!(fs::read_dir(dir.path().join(PICTURE_FOLDER)).expect("folder").count(), 1);
+        assert_eq!(
+            fs::read_dir(dir.path().join(PICTURE_FOLDER)).expect("folder").count(),
+            1
+        );
         Ok(())
     }
 
@@ -425,15 +456,25 @@ mod tests {
             model: Some("x".repeat(100_000)),
         };
         let error = journal.append(unit, 1.0, &long).expect_err("full").to_string();
-        assert!(error.contains("journal.db") && error.contains("disk is full"), "{error}");
+        assert!(
+            error.contains("journal.db") && error.contains("disk is full"),
+            "{error}"
+        );
         assert!(journal.events(unit).expect("still readable").is_empty());
 
         let other = tempfile::tempdir().expect("folder");
-        fs::write(other.path().join(JOURNAL_FILE), "no database, but long enough to look like one".repeat(40)).expect("written");
+        fs::write(
+            other.path().join(JOURNAL_FILE),
+            "no database, but long enough to look like one".repeat(40),
+        )
+        .expect("written");
         let error = Journal::open(other.path()).expect_err("no database").to_string();
         assert!(error.contains("damaged"), "{error}");
         let nothing = tempfile::tempdir().expect("folder");
-        assert!(matches!(Journal::open_read_only(nothing.path()), Err(JournalError::Missing { .. })));
+        assert!(matches!(
+            Journal::open_read_only(nothing.path()),
+            Err(JournalError::Missing { .. })
+        ));
         let file = nothing.path().join("file");
         fs::write(&file, "x").expect("written");
         assert!(matches!(Journal::open(&file), Err(JournalError::Folder { .. })));

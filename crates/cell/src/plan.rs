@@ -155,7 +155,9 @@ fn judge(
 ) -> (Found, Option<SafeTarget>) {
     let whole = shot.to_whole(screw.pixel);
     let sheet = sheet_normal(&shot.frame, screw.pixel, screw.diameter_px);
-    let mapped: Option<MappedPoint> = screw.camera.and_then(|point| arms.first().map(|reach| reach.map.apply(point)));
+    let mapped: Option<MappedPoint> = screw
+        .camera
+        .and_then(|point| arms.first().map(|reach| reach.map.apply(point)));
     let mut found = Found {
         u_px: whole.u_px,
         v_px: whole.v_px,
@@ -207,7 +209,10 @@ fn target(
     if !is_head_size(screw.diameter_px, point, shot, config) {
         return Err(LeftAlone::HeadSize);
     }
-    if found.tilt_rad.is_some_and(|tilt| tilt > config.exclusion.screw_tilt_max_rad) {
+    if found
+        .tilt_rad
+        .is_some_and(|tilt| tilt > config.exclusion.screw_tilt_max_rad)
+    {
         return Err(LeftAlone::Bent);
     }
     let normal = line_of_approach(sheet, screw.normal, face, config).ok_or(LeftAlone::NoDepth)?;
@@ -319,7 +324,10 @@ pub fn exclusion(face: &FaceRecord, least_screws: usize, config: &CellConfig) ->
     let sure_enough = |f: &&Found| f.verdict == Verdict::Review && f.score >= rules.review_score_min;
     let unclear: Vec<&Found> = face.found.iter().filter(sure_enough).collect();
     if unclear.len() > rules.review_max {
-        let places: Vec<String> = unclear.iter().map(|f| format!("({:.0}, {:.0})", f.u_px, f.v_px)).collect();
+        let places: Vec<String> = unclear
+            .iter()
+            .map(|f| format!("({:.0}, {:.0})", f.u_px, f.v_px))
+            .collect();
         return Some((
             ExclusionReason::SlotNotWorkable,
             format!(

@@ -186,7 +186,9 @@ impl Program {
                 if !done.contains(required.as_str()) {
                     return bad(
                         &step.name,
-                        format!("requires '{required}', which does not come before it; reorder the steps or correct the name"),
+                        format!(
+                            "requires '{required}', which does not come before it; reorder the steps or correct the name"
+                        ),
                     );
                 }
             }
@@ -251,6 +253,9 @@ mod tests {
         assert!(error.contains("screws_frist"), "{error}");
         let order = PAPER_PROGRAM.replacen("requires = [\"top cover\"]", "requires = [\"front cover\"]", 1);
         let error = Program::parse(&order, "x.toml").expect_err("order").to_string();
-        assert!(error.contains("front inner screws") && error.contains("front cover"), "{error}");
+        assert!(
+            error.contains("front inner screws") && error.contains("front cover"),
+            "{error}"
+        );
     }
 }

@@ -684,20 +684,52 @@ mod tests {
     fn times_add_up_to_the_clock_and_go_where_they_belong() {
         let events = [
             (10.0, Event::Arrived),
-            (10.0, Event::Intent { act: Act::Present { face: "front".into() } }),
+            (
+                10.0,
+                Event::Intent {
+                    act: Act::Present { face: "front".into() },
+                },
+            ),
             (15.0, Event::Presented { face: "front".into() }),
             (17.0, Event::Seen { face: face() }),
-            (21.0, Event::Driven { found: 0, arm: "arm_a".into(), burst: burst(DriveEnd::CamOut) }),
+            (
+                21.0,
+                Event::Driven {
+                    found: 0,
+                    arm: "arm_a".into(),
+                    burst: burst(DriveEnd::CamOut),
+                },
+            ),
             (21.0, Event::Recovery { on: true }),
-            (24.0, Event::Driven { found: 0, arm: "arm_a".into(), burst: burst(DriveEnd::Removed) }),
+            (
+                24.0,
+                Event::Driven {
+                    found: 0,
+                    arm: "arm_a".into(),
+                    burst: burst(DriveEnd::Removed),
+                },
+            ),
             (24.0, Event::Recovery { on: false }),
-            (25.0, Event::Verified { screws: vec![(0, false)], pictures: vec![] }),
+            (
+                25.0,
+                Event::Verified {
+                    screws: vec![(0, false)],
+                    pictures: vec![],
+                },
+            ),
             (28.0, Event::Discharged),
         ];
         let record = UnitRecord::from_events(1, 4.0, &events);
         let t = record.times;
         assert_eq!(
-            [t.waiting_s, t.handling_s, t.inspection_s, t.screws_s, t.recovery_s, t.covers_s],
+            [
+                t.waiting_s,
+                t.handling_s,
+                t.inspection_s,
+                t.screws_s,
+                t.recovery_s,
+                t.covers_s
+            ],
             [6.0, 8.0, 3.0, 4.0, 3.0, 0.0]
         );
         assert!((t.cycle_s() + t.waiting_s - 24.0).abs() < 1e-12);
@@ -711,9 +743,22 @@ mod tests {
     fn a_picture_outweighs_the_driver() {
         let mut record = UnitRecord::new(1, 0.0);
         record.apply(0.0, &Event::Seen { face: face() });
-        record.apply(1.0, &Event::Driven { found: 0, arm: "a".into(), burst: burst(DriveEnd::Removed) });
+        record.apply(
+            1.0,
+            &Event::Driven {
+                found: 0,
+                arm: "a".into(),
+                burst: burst(DriveEnd::Removed),
+            },
+        );
         assert_eq!(record.screws_out(), 1);
-        record.apply(2.0, &Event::Verified { screws: vec![(0, true)], pictures: vec![] });
+        record.apply(
+            2.0,
+            &Event::Verified {
+                screws: vec![(0, true)],
+                pictures: vec![],
+            },
+        );
         assert_eq!(record.screws_out(), 0);
     }
 

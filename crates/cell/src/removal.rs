@@ -1,7 +1,9 @@
 //! One screw: approach, drive, retreat; and the moves of the arms, none of which is ever sent twice.
 
 use crate::config::{Approach, Drive, Timeouts};
-use crate::device::{Arm, ArmState, Clock, DeviceError, DriveEnd, DriveProgram, DriverTool, Motion, RobotArm, Ticket, jobs};
+use crate::device::{
+    Arm, ArmState, Clock, DeviceError, DriveEnd, DriveProgram, DriverTool, Motion, RobotArm, Ticket, jobs,
+};
 use crate::plan::{SafeTarget, tool_pose};
 use crate::record::Burst;
 use geometry::{Base, Direction, Point, Tool, Transform};
@@ -49,7 +51,9 @@ pub struct Mover<'a> {
 
 impl std::fmt::Debug for Mover<'_> {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("Mover").field("arm", &self.robot().name()).finish_non_exhaustive()
+        f.debug_struct("Mover")
+            .field("arm", &self.robot().name())
+            .finish_non_exhaustive()
     }
 }
 
@@ -99,7 +103,12 @@ impl Mover<'_> {
         burst
     }
 
-    async fn burst_into(&self, target: &SafeTarget, program: DriveProgram, burst: &mut Burst) -> Result<(), DeviceError> {
+    async fn burst_into(
+        &self,
+        target: &SafeTarget,
+        program: DriveProgram,
+        burst: &mut Burst,
+    ) -> Result<(), DeviceError> {
         let Some(driver) = &self.arm.driver else {
             return Err(DeviceError::Refused {
                 device: self.robot().name().into(),
@@ -181,7 +190,11 @@ impl Mover<'_> {
     }
 
     async fn arrive(&self, ticket: Ticket, pose: Option<Transform<Base, Tool>>) -> Result<(), DeviceError> {
-        let timeout_s = if pose.is_some() { self.timeouts.move_s } else { self.timeouts.job_s };
+        let timeout_s = if pose.is_some() {
+            self.timeouts.move_s
+        } else {
+            self.timeouts.job_s
+        };
         match self.robot().wait(ticket, timeout_s).await {
             Ok(_) => Ok(()),
             Err(late @ DeviceError::Timeout { .. }) => self.settle(late, pose).await,
@@ -191,7 +204,11 @@ impl Mover<'_> {
 
     /// After a time-out: reads the state until the arm rests, then says whether it is where it was to go. Sends nothing.
     async fn settle(&self, lost: DeviceError, pose: Option<Transform<Base, Tool>>) -> Result<(), DeviceError> {
-        let limit_s = if pose.is_some() { self.timeouts.move_s } else { self.timeouts.job_s };
+        let limit_s = if pose.is_some() {
+            self.timeouts.move_s
+        } else {
+            self.timeouts.job_s
+        };
         let polls = (limit_s / POLL_S).ceil() as usize;
         for _ in 0..polls {
             let state = self.robot().state().await?;
@@ -202,7 +219,11 @@ impl Mover<'_> {
                 });
             }
             if !state.running {
-                return if pose.is_none_or(|pose| is_at(&state, &pose)) { Ok(()) } else { Err(lost) };
+                return if pose.is_none_or(|pose| is_at(&state, &pose)) {
+                    Ok(())
+                } else {
+                    Err(lost)
+                };
             }
             self.clock.pass(POLL_S);
             tokio::task::yield_now().await;

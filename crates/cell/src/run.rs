@@ -106,7 +106,9 @@ pub struct Runner {
 
 impl std::fmt::Debug for Runner {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("Runner").field("devices", &self.devices).finish_non_exhaustive()
+        f.debug_struct("Runner")
+            .field("devices", &self.devices)
+            .finish_non_exhaustive()
     }
 }
 
@@ -239,7 +241,8 @@ impl Runner {
                 Ok(()) | Err(DeviceError::Timeout { .. }) => {}
                 Err(error) => return Err(error),
             }
-            io.wait_for(tags::LOADED, on.clone(), self.config.timeouts.load_s).await?;
+            io.wait_for(tags::LOADED, on.clone(), self.config.timeouts.load_s)
+                .await?;
         }
         io.write(tags::MAGNET, on).await
     }
@@ -317,7 +320,8 @@ impl Way<'_> {
         if let Ok(json) = serde_json::to_string(&self.record)
             && let Err(error) = self.runner.devices.plant.report(&json).await
         {
-            self.observer.note(&format!("the plant was not told of unit {}: {error}", self.record.unit));
+            self.observer
+                .note(&format!("the plant was not told of unit {}: {error}", self.record.unit));
         }
         self.observer.finished(&self.record);
         Ok(self.record)
@@ -328,16 +332,22 @@ impl Way<'_> {
         let program = self.runner.program.clone();
         if self.record.steps_done == 0 && self.record.attempts().next().is_none() {
             for face in &program.survey {
-                let seen = self.record.faces.iter().any(|f| f.face == *face && f.purpose == Purpose::Survey);
+                let seen = self
+                    .record
+                    .faces
+                    .iter()
+                    .any(|f| f.face == *face && f.purpose == Purpose::Survey);
                 if !seen {
                     self.look_at(0, &program.steps[0], face, Purpose::Survey).await?;
                 }
             }
         }
         for (index, step) in program.steps.iter().enumerate().skip(self.record.steps_done) {
-            self.observer.step(self.record.unit, index, program.steps.len(), &step.name);
+            self.observer
+                .step(self.record.unit, index, program.steps.len(), &step.name);
             // after a crash the cover of this step may be off already
-            let off = matches!(&step.work, Work::Cover { cover, .. } if self.record.covers_off().contains(&cover.as_str()));
+            let off =
+                matches!(&step.work, Work::Cover { cover, .. } if self.record.covers_off().contains(&cover.as_str()));
             if !off {
                 if step.has_screws() {
                     self.screws(index, step, &step.present, Purpose::Work).await?;
@@ -366,8 +376,12 @@ impl Way<'_> {
         };
         let index = self.record.steps_done;
         let program = self.runner.program.clone();
-        let Some(step) = program.steps.get(index) else { return Ok(()) };
-        let Work::Cover { takes_along, .. } = &step.work else { return Ok(()) };
+        let Some(step) = program.steps.get(index) else {
+            return Ok(());
+        };
+        let Work::Cover { takes_along, .. } = &step.work else {
+            return Ok(());
+        };
         let holding = self.runner.devices.io.read(tags::GRIPPER_HOLDING).await? == TagValue::Bool(true);
         let (end, seen_by) = if holding {
             (PullEnd::Off, SeenBy::Signal)
@@ -395,7 +409,13 @@ impl Way<'_> {
     /// Whether the face that stands before the camera is still where it was when it was last looked at.
     async fn is_cover_off(&mut self, face: &FaceId) -> Result<PullEnd, Stop> {
         let config = self.runner.config.inspection;
-        let before = self.record.faces.iter().rev().find(|f| f.face == *face).and_then(|f| f.plane);
+        let before = self
+            .record
+            .faces
+            .iter()
+            .rev()
+            .find(|f| f.face == *face)
+            .and_then(|f| f.plane);
         let shot = shoot(&self.runner.devices, None, config.depth_frames.max(1)).await?;
         let now = FaceFit::of(&shot.frame, config.working_depth_mm).and_then(|fit| fit.plane());
         Ok(match (before, now) {
@@ -440,7 +460,10 @@ impl Way<'_> {
         self.budget(&shot);
         let fit = FaceFit::of(&shot.frame, config.inspection.working_depth_mm);
         let (found, targets) = plan::plan(&screws, &shot, fit.as_ref(), &self.reaches(), &config);
-        let picture = self.runner.journal.store_picture(&shot.frame.color, config.journal.jpeg_quality)?;
+        let picture = self
+            .runner
+            .journal
+            .store_picture(&shot.frame.color, config.journal.jpeg_quality)?;
         let seen = FaceRecord {
             step: index,
             step_name: step.name.clone(),
@@ -455,8 +478,16 @@ impl Way<'_> {
             attempts: Vec::new(),
         };
         // Excluded is what was out of scope before this face was touched. Once it has been, a failure is a failure.
-        let touched = self.record.faces.iter().any(|f| f.face == *face && !f.attempts.is_empty());
-        let least = if purpose == Purpose::Work { step.least_screws() } else { 0 };
+        let touched = self
+            .record
+            .faces
+            .iter()
+            .any(|f| f.face == *face && !f.attempts.is_empty());
+        let least = if purpose == Purpose::Work {
+            step.least_screws()
+        } else {
+            0
+        };
         let excluded = if touched || purpose == Purpose::Missed {
             None
         } else {
@@ -537,10 +568,20 @@ impl Way<'_> {
         program: DriveProgram,
         second_look: Option<PictureId>,
     ) -> Result<Option<DriveEnd>, Stop> {
-        let Some(arm) = self.runner.devices.arms.get(place.arm()).map(|arm| arm.robot.name().to_owned()) else {
+        let Some(arm) = self
+            .runner
+            .devices
+            .arms
+            .get(place.arm())
+            .map(|arm| arm.robot.name().to_owned())
+        else {
             return Ok(None);
         };
-        let done = self.record.faces.last().and_then(|f| f.attempts.iter().find(|a| a.found == found));
+        let done = self
+            .record
+            .faces
+            .last()
+            .and_then(|f| f.attempts.iter().find(|a| a.found == found));
         self.log(Event::Intent {
             act: Act::Drive {
                 found,
@@ -580,10 +621,18 @@ impl Way<'_> {
         let Some(region) = region_around(&camera, center, half_px) else {
             return Ok(None);
         };
-        let near = shoot(&self.runner.devices, Some(region), config.inspection.depth_frames.max(1)).await?;
+        let near = shoot(
+            &self.runner.devices,
+            Some(region),
+            config.inspection.depth_frames.max(1),
+        )
+        .await?;
         let screws = self.runner.finder.find(&near.frame);
         self.budget(&near);
-        let picture = self.runner.journal.store_picture(&near.frame.color, config.journal.jpeg_quality)?;
+        let picture = self
+            .runner
+            .journal
+            .store_picture(&near.frame.color, config.journal.jpeg_quality)?;
         let same_px = config.inspection.same_screw_mm * half_px / config.inspection.second_look_mm;
         let closest = screws
             .into_iter()
@@ -623,11 +672,16 @@ impl Way<'_> {
         };
         let mut again = false;
         for found in standing {
-            let tried = self.record.faces.last().and_then(|f| f.attempts.iter().find(|a| a.found == found));
+            let tried = self
+                .record
+                .faces
+                .last()
+                .and_then(|f| f.attempts.iter().find(|a| a.found == found));
             let retried = tried.is_some_and(|a| a.retries() > 0);
             if let Some(target) = targets.iter().find(|t| t.found == found && !retried) {
                 self.log(Event::Recovery { on: true })?;
-                self.retry(target, shot, Retry::LookAgain(self.runner.config.drive.first)).await?;
+                self.retry(target, shot, Retry::LookAgain(self.runner.config.drive.first))
+                    .await?;
                 again = true;
             }
         }
@@ -644,11 +698,16 @@ impl Way<'_> {
         asks: impl Fn(&ScrewAttempt) -> bool,
         shot: &Shot,
     ) -> Result<Option<Vec<usize>>, Stop> {
-        let Some(face) = self.record.faces.last() else { return Ok(None) };
+        let Some(face) = self.record.faces.last() else {
+            return Ok(None);
+        };
         let asked: Vec<usize> = face.attempts.iter().filter(|a| asks(a)).map(|a| a.found).collect();
         let places: Vec<(usize, Pixel, f64)> = asked
             .iter()
-            .filter_map(|found| self.place_in_picture(*found, shot).map(|(pixel, half_px)| (*found, pixel, half_px)))
+            .filter_map(|found| {
+                self.place_in_picture(*found, shot)
+                    .map(|(pixel, half_px)| (*found, pixel, half_px))
+            })
             .collect();
         let Some(half_px) = places.iter().map(|p| p.2).reduce(f64::max) else {
             return Ok(None);
@@ -663,7 +722,11 @@ impl Way<'_> {
             let near = shoot(&self.runner.devices, Some(region), 0).await?;
             let screws = self.runner.finder.find(&near.frame);
             self.budget(&near);
-            pictures.push(self.runner.journal.store_picture(&near.frame.color, config.journal.jpeg_quality)?);
+            pictures.push(
+                self.runner
+                    .journal
+                    .store_picture(&near.frame.color, config.journal.jpeg_quality)?,
+            );
             let standing = screws.iter().filter(|s| s.verdict == Verdict::Screw);
             seen.extend(standing.map(|s| near.to_whole(s.pixel)));
         }
@@ -689,7 +752,9 @@ impl Way<'_> {
         if let Some(known) = self.known_standing(held_by) {
             return Err(Stop::Decided(known));
         }
-        self.observer.note(&format!("the {cover} cover does not come off: looking for missed screws"));
+        self.observer.note(&format!(
+            "the {cover} cover does not come off: looking for missed screws"
+        ));
         self.log(Event::Recovery { on: true })?;
         let mut pulled_again = false;
         for face in held_by {
@@ -707,9 +772,11 @@ impl Way<'_> {
         if !pulled_again && self.pull(index, step).await? == PullEnd::Off {
             return Ok(self.log(Event::Recovery { on: false })?);
         }
-        Err(Stop::Decided(self.known_standing(held_by).unwrap_or_else(|| Outcome::Ng {
-            reason: NgReason::CoverStuck,
-            detail: format!("the {cover} cover did not come off, and no screw that holds it was seen"),
+        Err(Stop::Decided(self.known_standing(held_by).unwrap_or_else(|| {
+            Outcome::Ng {
+                reason: NgReason::CoverStuck,
+                detail: format!("the {cover} cover did not come off, and no screw that holds it was seen"),
+            }
         })))
     }
 
@@ -719,20 +786,21 @@ impl Way<'_> {
             let Some(last) = self.record.faces.iter().rev().find(|f| f.face == *face) else {
                 continue;
             };
-            let failed = last.attempts.iter().filter(|a| !a.removed() && a.still_there != Some(false));
-            for attempt in failed {
+            let failed = last
+                .attempts
+                .iter()
+                .find(|a| !a.removed() && a.still_there != Some(false));
+            if let Some(attempt) = failed {
                 let (reason, what) = match attempt.end() {
                     Some(DriveEnd::Seized) => (NgReason::ScrewSeized, "did not turn"),
                     Some(DriveEnd::CamOut) => (NgReason::ScrewCamOut, "let the bit slip"),
                     Some(DriveEnd::MissedHead | DriveEnd::Removed) => (NgReason::ScrewMissed, "was not met by the bit"),
                     Some(DriveEnd::TimeOut) | None => (NgReason::DeviceFault, "could not be worked on"),
                 };
+                let bursts = attempt.bursts.len();
                 return Some(Outcome::Ng {
                     reason,
-                    detail: format!(
-                        "{face}: a screw {what} in {} burst(s), its cover stays",
-                        attempt.bursts.len()
-                    ),
+                    detail: format!("{face}: a screw {what} in {bursts} burst(s), its cover stays"),
                 });
             }
             let barred = [
@@ -804,7 +872,9 @@ impl Way<'_> {
             Work::Screws { .. } => None,
         });
         let arms = &self.runner.devices.arms;
-        let arm = pullers.filter_map(|by| arms.iter().position(|arm| arm.robot.name() == by)).next();
+        let arm = pullers
+            .filter_map(|by| arms.iter().position(|arm| arm.robot.name() == by))
+            .next();
         if let Some(mover) = arm.and_then(|arm| self.mover(arm)) {
             mover.job(jobs::DROP).await?;
         }
@@ -832,7 +902,10 @@ impl Way<'_> {
             Err(error) => return Err(error.into()),
         }
         let gone = TagValue::Bool(false);
-        match io.wait_for(tags::LOADED, gone.clone(), self.runner.config.timeouts.discharge_s).await {
+        match io
+            .wait_for(tags::LOADED, gone.clone(), self.runner.config.timeouts.discharge_s)
+            .await
+        {
             Err(late @ DeviceError::Timeout { .. }) => {
                 if io.read(tags::LOADED).await? == gone {
                     Ok(())

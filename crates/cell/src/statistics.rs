@@ -195,7 +195,10 @@ mod tests {
             unit(5, None, 0.0),
         ];
         let s = Statistics::over(&records);
-        assert_eq!((s.units, s.ok, s.ng, s.excluded, s.excluded_after_acting), (4, 2, 1, 1, 1));
+        assert_eq!(
+            (s.units, s.ok, s.ng, s.excluded, s.excluded_after_acting),
+            (4, 2, 1, 1, 1)
+        );
         assert_eq!(s.ok_in_scope.rate, Some(2.0 / 3.0));
         assert_eq!(s.ok_of_all.rate, Some(0.5));
         assert_eq!((s.cycle_mean_s, s.cycle_ok_mean_s), (Some(160.0), Some(190.0)));

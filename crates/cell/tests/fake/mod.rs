@@ -4,9 +4,7 @@ use async_trait::async_trait;
 use calibration::{Map, Pair, Settings, Volume, lattice};
 use cell::device::*;
 use cell::run::Finder;
-use geometry::{
-    Base, Camera, CameraModel, DepthMap, Direction, Pixel, Point, RgbImage, RgbdFrame, Tool, Transform,
-};
+use geometry::{Base, Camera, CameraModel, DepthMap, Direction, Pixel, Point, RgbImage, RgbdFrame, Tool, Transform};
 use nalgebra::{Matrix3, Rotation3, UnitQuaternion, Vector3};
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::{Arc, Mutex, MutexGuard};
@@ -69,8 +67,9 @@ pub struct World {
     pub calls: BTreeMap<&'static str, usize>,
 }
 
+/// The world, and word of the program's death.
 #[derive(Clone)]
-pub struct Fake(pub Arc<Mutex<World>>);
+pub struct Fake(pub Arc<Mutex<World>>, pub Arc<tokio::sync::Notify>);
 
 impl Fake {
     pub fn new(faces: &[(&str, Vec<Head>)]) -> Self {
@@ -79,23 +78,26 @@ impl Fake {
             all.insert((*face).to_owned(), heads.clone());
         }
         let rest = cell::plan::tool_pose(Point::new(300.0, 0.0, 900.0), Direction::new(1.0, 0.0, 0.0).expect("x"));
-        Self(Arc::new(Mutex::new(World {
-            t_s: 0.0,
-            loaded: false,
-            presented: String::new(),
-            holding: false,
-            faces: all,
-            tilt_rad: BTreeMap::new(),
-            off: Vec::new(),
-            log: Vec::new(),
-            poses: Vec::new(),
-            pose: [rest, rest],
-            lose_answer_of_move: None,
-            lose_answer_of_burst: None,
-            lie_at_burst: None,
-            die_at: None,
-            calls: BTreeMap::new(),
-        })))
+        Self(
+            Arc::new(Mutex::new(World {
+                t_s: 0.0,
+                loaded: false,
+                presented: String::new(),
+                holding: false,
+                faces: all,
+                tilt_rad: BTreeMap::new(),
+                off: Vec::new(),
+                log: Vec::new(),
+                poses: Vec::new(),
+                pose: [rest, rest],
+                lose_answer_of_move: None,
+                lose_answer_of_burst: None,
+                lie_at_burst: None,
+                die_at: None,
+                calls: BTreeMap::new(),
+            })),
+            Arc::new(tokio::sync::Notify::new()),
+        )
     }
 
     /// A unit with two screws on every face.
@@ -139,6 +141,13 @@ impl Fake {
         (n, dies)
     }
 
+    /// A call that never returns.
+    async fn die(&self) -> ! {
+        self.1.notify_one();
+        std::future::pending::<()>().await;
+        unreachable!("pending never ends")
+    }
+
     pub fn calls(&self, name: &str) -> usize {
         self.world().calls.get(name).copied().unwrap_or(0)
     }
@@ -148,13 +157,13 @@ impl Fake {
     /// Entries of the log that begin with any of these.
     pub fn entries(&self, of: &[&str]) -> Vec<String> {
         let world = self.world();
-        world.log.iter().filter(|l| of.iter().any(|o| l.starts_with(o))).cloned().collect()
+        world
+            .log
+            .iter()
+            .filter(|l| of.iter().any(|o| l.starts_with(o)))
+            .cloned()
+            .collect()
     }
-}
-
-async fn die() -> ! {
-    std::future::pending::<()>().await;
-    unreachable!("pending never ends")
 }
 
 pub fn camera() -> CameraModel {
@@ -347,7 +356,7 @@ impl RobotArm for FakeArm {
     async fn move_to(&self, base_from_tool: Transform<Base, Tool>, _: Motion) -> Result<Ticket, DeviceError> {
         let (n, dies) = self.fake.call("move", 0.4);
         if dies == Some(false) {
-            die().await;
+            self.fake.die().await;
         }
         {
             let mut world = self.fake.world();
@@ -356,7 +365,7 @@ impl RobotArm for FakeArm {
             world.pose[self.index] = base_from_tool;
         }
         if dies == Some(true) {
-            die().await;
+            self.fake.die().await;
         }
         if self.fake.world().lose_answer_of_move == Some(n) {
             return Err(timeout(&self.name, "move"));
@@ -372,7 +381,7 @@ impl RobotArm for FakeArm {
         }
         let (n, dies) = self.fake.call("job", 5.0);
         if dies == Some(false) {
-            die().await;
+            self.fake.die().await;
         }
         {
             let mut world = self.fake.world();
@@ -382,7 +391,11 @@ impl RobotArm for FakeArm {
             } else if let Some(cover) = job.strip_prefix("PULL_").map(str::to_lowercase) {
                 let holds: &[&str] = match cover.as_str() {
                     "front" => &["front", "front_inner", "left"],
-                    other => &[FACES.iter().copied().find(|f| *f == other).expect("a cover that is a face")],
+                    other => &[FACES
+                        .iter()
+                        .copied()
+                        .find(|f| *f == other)
+                        .expect("a cover that is a face")],
                 };
                 let held = holds.iter().any(|f| world.faces[*f].iter().any(|h| h.stands));
                 if !held && !world.off.contains(&cover) {
@@ -392,7 +405,7 @@ impl RobotArm for FakeArm {
             }
         }
         if dies == Some(true) {
-            die().await;
+            self.fake.die().await;
         }
         Ok(Ticket(n as u64))
     }
@@ -410,7 +423,7 @@ impl DriverTool for Fake {
     async fn drive(&self, program: DriveProgram) -> Result<DriveResult, DeviceError> {
         let (n, dies) = self.call("drive", 2.0);
         if dies == Some(false) {
-            die().await;
+            self.die().await;
         }
         let end = {
             let mut world = self.world();
@@ -419,7 +432,9 @@ impl DriverTool for Fake {
             let lie = world.lie_at_burst == Some(n);
             let face = world.presented.clone();
             let heads = world.faces.get_mut(&face).expect("a face");
-            let met = heads.iter_mut().find(|h| h.stands && on_face(h.at_mm, tilt).distance_mm(tip) < 0.75);
+            let met = heads
+                .iter_mut()
+                .find(|h| h.stands && on_face(h.at_mm, tilt).distance_mm(tip) < 0.75);
             let end = match met {
                 None => DriveEnd::MissedHead,
                 Some(head) => {
@@ -429,11 +444,14 @@ impl DriverTool for Fake {
                     end
                 }
             };
-            world.log.push(format!("drive {face} {:.0} N {:.1} s", program.axial_force_n, program.max_time_s));
+            world.log.push(format!(
+                "drive {face} {:.0} N {:.1} s",
+                program.axial_force_n, program.max_time_s
+            ));
             end
         };
         if dies == Some(true) {
-            die().await;
+            self.die().await;
         }
         if self.world().lose_answer_of_burst == Some(n) {
             return Err(timeout("driver", "drive"));
@@ -481,7 +499,11 @@ impl CellIo for Fake {
         Ok(())
     }
     async fn wait_for(&self, tag: &str, value: TagValue, _: f64) -> Result<(), DeviceError> {
-        if CellIo::read(self, tag).await? == value { Ok(()) } else { Err(timeout("io", tag)) }
+        if CellIo::read(self, tag).await? == value {
+            Ok(())
+        } else {
+            Err(timeout("io", tag))
+        }
     }
 }
 
