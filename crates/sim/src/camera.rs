@@ -93,6 +93,7 @@ fn subject(world: &mut World, device: &str) -> Result<Subject, DeviceError> {
     };
     let mut camera_from_marker: Transform<geometry::Camera, Tool> = arm.camera_from_true_tool(now_s);
     let seed = world.seed();
+    let scene_seed = *world.jig_seed.get_or_insert_with(|| green_jig(seed));
     let exposure = world.exposures;
     let mut rng = draw(seed, &[90, exposure]);
     let mut moved = |low: f64, high: f64| {
@@ -109,12 +110,34 @@ fn subject(world: &mut World, device: &str) -> Result<Subject, DeviceError> {
     Ok(Subject::Marker(Box::new(MarkerView {
         camera: world.true_camera,
         camera_from_marker,
-        scene_seed: mix(seed, &[91]),
+        scene_seed,
         sensor: Sensor {
             noise_seed: mix(seed, &[92, exposure]),
             ..Sensor::sample(mix(seed, &[93]))
         },
     })))
+}
+
+/// Jigs come with discs of several colours; this cell has a green one, as the marker finder expects unless told otherwise.
+fn green_jig(seed: u64) -> u64 {
+    let camera = scene::camera(seed);
+    let middle = camera.project(geometry::Point::new(0.0, 0.0, 1500.0));
+    let green = |scene_seed: u64| {
+        let view = MarkerView {
+            camera,
+            camera_from_marker: Transform::from_parts([0.0, 0.0, 1500.0], UnitQuaternion::identity()),
+            scene_seed,
+            sensor: Sensor::sample(seed),
+        };
+        let roi = middle.map(|pixel| Roi::around(&camera, pixel, 8));
+        let sum = scene::render_marker(&view, roi)
+            .color
+            .pixels()
+            .fold([0u32; 3], |sum, p| std::array::from_fn(|c| sum[c] + u32::from(p.0[c])));
+        sum[1] > sum[0] && sum[1] > sum[2]
+    };
+    let mut candidates = (0..64).map(|k| mix(seed, &[91, k]));
+    candidates.find(|s| green(*s)).unwrap_or(mix(seed, &[91, 0]))
 }
 
 fn shoot(subject: &Subject, roi: Option<Roi>) -> Rendered {

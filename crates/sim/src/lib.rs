@@ -36,6 +36,7 @@ pub use score::{Action, ActionKind, Aim, Score, ScrewScore, UnitScore};
 pub use world::unit_seed;
 
 use cell::device::{Arm, Devices};
+use scene::FaceTruth;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 use std::sync::{Arc, Mutex};
@@ -176,6 +177,12 @@ impl SimulatedCell {
     /// What really happened so far. For reports and evaluation, never for deciding.
     pub fn score(&self) -> Score {
         lock(&self.world).score()
+    }
+
+    /// What is really on the face that stands before the camera, screws already out included; `None` while none does. For
+    /// reports and evaluation, never for deciding.
+    pub fn face_truth(&self) -> Option<FaceTruth> {
+        lock(&self.world).truth().map(|truth| (*truth).clone())
     }
 
     /// What the plant was told: one JSON text a finished unit.

@@ -296,6 +296,16 @@ fn the_same_seed_gives_the_same_pictures() -> Result<(), DeviceError> {
     })
 }
 
+/// Middle of everything green.
+fn green_centre(picture: &geometry::RgbImage) -> (f64, f64) {
+    let green = |p: &[u8; 3]| p[1] > p[0].saturating_add(20) && p[1] > p[2].saturating_add(20);
+    let pixels = picture.enumerate_pixels().filter(|(_, _, p)| green(&p.0));
+    let (n, u, v) = pixels.fold((0.0, 0.0, 0.0), |(n, u, v), (x, y, _)| {
+        (n + 1.0, u + f64::from(x), v + f64::from(y))
+    });
+    (u / n, v / n)
+}
+
 #[test]
 fn the_camera_shows_the_marker_where_the_tool_really_is() -> Result<(), DeviceError> {
     let cell = SimulatedCell::new(SimSettings::default());
@@ -320,12 +330,12 @@ fn the_camera_shows_the_marker_where_the_tool_really_is() -> Result<(), DeviceEr
         };
         let color = cell.devices.color.grab(Some(region)).await?;
         let depth = cell.devices.depth.grab(Some(region)).await?;
-        // the disc is coloured, the paddle is not
-        let colourful = |x: u32, y: u32| {
-            let p = color.image.get_pixel(x, y).0;
-            f64::from(p.iter().max().copied().unwrap_or(0)) - f64::from(p.iter().min().copied().unwrap_or(0))
-        };
-        assert!(colourful(100, 100) > 25.0 + colourful(35, 100).min(colourful(165, 100)));
+        // a green disc on a white paddle
+        let [r, g, b] = color.image.get_pixel(100, 100).0;
+        assert!(g > r.saturating_add(25) && g > b.saturating_add(25), "{r} {g} {b}");
+        let (u, v) = green_centre(&color.image);
+        let off = (u + f64::from(region.x_px) - pixel.u_px).hypot(v + f64::from(region.y_px) - pixel.v_px);
+        assert!(off < 1.0, "{off} px off");
         let middle = depth
             .map
             .plane_at(geometry::Pixel::new(100.0, 100.0), 0.0, 20.0)

@@ -90,6 +90,8 @@ pub(crate) struct World {
     fed: u64,
     pub(crate) exposures: u64,
     pub(crate) last_shot: Option<LastShot>,
+    /// Which jig the cell has, once it was looked at.
+    pub(crate) jig_seed: Option<u64>,
     pub(crate) reports: Vec<String>,
     actions: Vec<Action>,
     done: Vec<UnitScore>,
@@ -122,6 +124,7 @@ impl World {
             fed: 0,
             exposures: 0,
             last_shot: None,
+            jig_seed: None,
             reports: Vec::new(),
             actions: Vec::new(),
             done: Vec::new(),
@@ -205,6 +208,7 @@ impl World {
                     if let Some(loaded) = &mut self.unit {
                         loaded.presented = Some(*face);
                     }
+                    self.truth();
                 }
                 ActionKind::Drive {
                     screw: Some(id), end, ..
@@ -271,6 +275,8 @@ impl World {
                     loaded.presented = Some(face);
                 }
                 self.record(ActionKind::Presented { face });
+                // Known for the score also where nothing is driven.
+                self.truth();
             }
             TableJob::Discharge => {
                 self.record(ActionKind::Discharged);
