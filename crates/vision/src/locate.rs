@@ -110,7 +110,7 @@ mod tests {
     const AT: Pixel = Pixel::new(400.3, 300.6);
     const DIAMETER_PX: f64 = 34.0;
 
-    /// A head 3 mm above its sheet, with a recess 2 mm deep, tilted, half resolution, stereo noise.
+    /// A domed head, its rim 3 mm above its sheet, with a recess 2 mm deep, tilted, half resolution, stereo noise.
     fn scene(keep: impl Fn(f64) -> bool) -> (DepthMap, CameraModel) {
         let camera = CameraModel::pinhole(800, 600, 4638.0, 4638.0);
         let (width, height, mut random) = (400, 300, 7);
@@ -127,7 +127,7 @@ mod tests {
                 let relief = if r < 0.23 {
                     2.0
                 } else if r < 0.5 {
-                    0.0
+                    1.1 * (r * r - 0.23 * 0.23) / (0.5 * 0.5 - 0.23 * 0.23)
                 } else {
                     3.0
                 };
