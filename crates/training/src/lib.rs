@@ -1,1 +1,14 @@
-//! Data sets, augmentation, training, evaluation.
+//! Data sets, augmentation, training, evaluation: from rendered faces and real photographs to one model file, and from a model to
+//! figures with bounds.
+//!
+//! Beside the way of one unit, not in it: `vision` only ever sees the file that [`train`] writes. It uses `scene` for pictures with
+//! exact truth, `nn` to learn, `vision` for what the networks see and say.
+
+mod batch;
+mod real;
+mod samples;
+mod train;
+mod tune;
+
+pub use train::{Progress, TRAINING_SEEDS, TUNING_SEEDS, TrainError, TrainReport, TrainSettings, train};
+pub use tune::Tuning;

@@ -1,0 +1,285 @@
+//! From patches to what the networks are fed: crop, turn, scale, light, and the targets of every cell.
+
+use crate::samples::{Classes, PATCH_PX, Patch, only};
+use geometry::{Pixel, RgbImage};
+use nn::Tensor;
+use rand::{RngExt, SeedableRng};
+use rand_pcg::Pcg64Mcg;
+use rayon::prelude::*;
+use vision::Clip;
+use vision::layout::{
+    CLASS_CHANNELS, CLASSES, CLIP_CENTER_PX, CLIP_PX, Class, IGNORE_RADIUS, LABEL_RADIUS, LN_DIAMETER, NOMINAL_HEAD_PX,
+    OFFSET_U, OFFSET_UNIT_PX, OFFSET_V, STRIDE, cell_center_px, network_value,
+};
+
+/// Side of the coarse network's training crop, px.
+pub const COARSE_PX: usize = 96;
+
+/// Which network a batch is for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Stage {
+    /// Stage 1: larger crops, no gamma correction.
+    Coarse,
+    /// Stage 2: clips around a candidate, gamma corrected.
+    Fine,
+}
+
+impl Stage {
+    /// Side of the crop, px.
+    pub fn side_px(self) -> usize {
+        match self {
+            Stage::Coarse => COARSE_PX,
+            Stage::Fine => CLIP_PX,
+        }
+    }
+}
+
+/// Target of one cell.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Target {
+    /// Classes that it may be; 0: ignored.
+    pub classes: Classes,
+    /// Weight in the loss.
+    pub weight: f32,
+    /// Offset and ln diameter as the network gives them, where known.
+    pub regression: Option<[f32; 3]>,
+}
+
+/// Pictures and targets for a step of training.
+pub struct Batch {
+    /// The networks' input.
+    pub input: Tensor,
+    /// A target for every output cell.
+    pub targets: Vec<Target>,
+}
+
+/// Draws a batch: patch `picks[i]`, augmented by seed.
+pub fn batch(stage: Stage, patches: &[Patch], picks: &[usize], seed: u64) -> Batch {
+    let side = stage.side_px();
+    let cells = side / STRIDE;
+    let mut input = Tensor::zeros(picks.len(), side, side, 3);
+    let mut targets = vec![Target::default(); picks.len() * cells * cells];
+    input
+        .data
+        .par_chunks_mut(side * side * 3)
+        .zip(targets.par_chunks_mut(cells * cells))
+        .zip(picks)
+        .enumerate()
+        .for_each(|(i, ((pixels, targets), &pick))| {
+            let mut rng = Pcg64Mcg::seed_from_u64(seed.wrapping_mul(0x9E37_79B9_7F4A_7C15) ^ (i as u64) << 20);
+            fill(stage, &patches[pick], &mut rng, pixels, targets);
+        });
+    Batch { input, targets }
+}
+
+fn fill(stage: Stage, patch: &Patch, rng: &mut Pcg64Mcg, pixels: &mut [f32], targets: &mut [Target]) {
+    let side = stage.side_px();
+    let mut normal = |sigma: f64| sigma * (0..4).map(|_| rng.random_range(-1.0..1.0)).sum::<f64>() * 0.866;
+    // where the crop's middle comes from: near the item for what a candidate looks like, anywhere for background
+    let middle = PATCH_PX as f64 / 2.0 - 0.5;
+    let focus = patch.labels.first().filter(|_| patch.focused).map(|l| [f64::from(l.u_px), f64::from(l.v_px)]);
+    let jitter = if stage == Stage::Fine && focus.is_some() { 3.5 } else { 10.0 };
+    let mut source = focus.filter(|_| stage == Stage::Fine).unwrap_or([middle, middle]);
+    source = source.map(|c| c + normal(jitter).clamp(-12.0, 12.0));
+    let scale = normal(0.12).exp().clamp(0.72, 1.4);
+    let angle: f64 = normal(0.12);
+    let flip = rng.random_bool(0.5);
+    let turns = rng.random_range(0..4);
+    // crop pixel -> patch pixel
+    let (sin, cos) = angle.sin_cos();
+    let half = if stage == Stage::Fine { CLIP_CENTER_PX as f64 } else { side as f64 / 2.0 };
+    let forward = move |x: f64, y: f64| {
+        let (mut dx, mut dy) = (x - half, y - half);
+        if flip {
+            dx = -dx;
+        }
+        for _ in 0..turns {
+            (dx, dy) = (-dy, dx);
+        }
+        [source[0] + (cos * dx - sin * dy) / scale, source[1] + (sin * dx + cos * dy) / scale]
+    };
+    let backward = move |u: f64, v: f64| {
+        let (du, dv) = ((u - source[0]) * scale, (v - source[1]) * scale);
+        let (mut dx, mut dy) = (cos * du + sin * dv, -sin * du + cos * dv);
+        for _ in 0..turns {
+            (dx, dy) = (dy, -dx);
+        }
+        if flip {
+            dx = -dx;
+        }
+        [dx + half, dy + half]
+    };
+    let mut rgb = vec![0f32; side * side * 3];
+    for y in 0..side {
+        for x in 0..side {
+            let [u, v] = forward(x as f64, y as f64);
+            sample(&patch.rgb, u, v, &mut rgb[3 * (y * side + x)..][..3]);
+        }
+    }
+    relight(&mut rgb, side, rng);
+    let bytes: Vec<u8> = rgb.iter().map(|v| v.round().clamp(0.0, 255.0) as u8).collect();
+    match stage {
+        Stage::Fine => {
+            let Some(clip) = RgbImage::from_raw(side as u32, side as u32, bytes) else { return };
+            Clip::cut(&clip, Pixel::new(CLIP_CENTER_PX as f64, CLIP_CENTER_PX as f64)).network_input(pixels);
+        }
+        Stage::Coarse => pixels.iter_mut().zip(bytes).for_each(|(to, from)| *to = network_value(from)),
+    }
+    let cells = side / STRIDE;
+    let labels: Vec<_> = patch
+        .labels
+        .iter()
+        .map(|l| (backward(f64::from(l.u_px), f64::from(l.v_px)), f64::from(l.diameter_px) * scale, l))
+        .collect();
+    for (k, target) in targets.iter_mut().enumerate() {
+        let (x, y) = (cell_center_px(k % cells), cell_center_px(k / cells));
+        let nearest = labels
+            .iter()
+            .map(|(at, d, label)| ((x - at[0]).hypot(y - at[1]) / d, at, *d, *label))
+            .min_by(|a, b| a.0.total_cmp(&b.0));
+        *target = match nearest {
+            Some((r, at, d, label)) if r < LABEL_RADIUS => Target {
+                classes: label.classes,
+                weight: 1.0,
+                regression: label.exact.then(|| {
+                    [
+                        ((at[0] - x) / OFFSET_UNIT_PX) as f32,
+                        ((at[1] - y) / OFFSET_UNIT_PX) as f32,
+                        (d / NOMINAL_HEAD_PX).ln() as f32,
+                    ]
+                }),
+            },
+            Some((r, _, _, label)) if r < IGNORE_RADIUS || (label.classes == 0 && r < 0.8) => Target::default(),
+            _ => Target { classes: patch.elsewhere, weight: if stage == Stage::Fine { 0.12 } else { 0.3 }, regression: None },
+        };
+        if stage == Stage::Coarse && target.classes != 0 {
+            coarse(target);
+        }
+    }
+}
+
+/// Two classes for stage 1: may it be a fastener? Marks and holes that look alike weigh less: stage 2 tells them apart.
+fn coarse(target: &mut Target) {
+    let fasteners = crate::samples::any_fastener();
+    if target.classes & fasteners == 0 {
+        target.weight = if target.classes & only(Class::OtherFeature) != 0 { 0.4 } else { target.weight };
+        target.classes = 0b01;
+    } else if target.classes & !fasteners == 0 {
+        target.weight = if target.classes & only(Class::Cross) != 0 { 4.0 } else { 2.0 };
+        target.classes = 0b10;
+    } else {
+        *target = Target::default();
+    }
+    target.regression = None;
+}
+
+fn sample(rgb: &[u8], u: f64, v: f64, out: &mut [f32]) {
+    let last = (PATCH_PX - 1) as f64;
+    let (u, v) = (u.clamp(0.0, last - 1e-6), v.clamp(0.0, last - 1e-6));
+    let (i, j) = (u as usize, v as usize);
+    let (fx, fy) = ((u - i as f64) as f32, (v - j as f64) as f32);
+    for (c, value) in out.iter_mut().enumerate() {
+        let at = |di: usize, dj: usize| f32::from(rgb[3 * ((j + dj) * PATCH_PX + i + di) + c]);
+        let top = at(0, 0) + fx * (at(1, 0) - at(0, 0));
+        let bottom = at(0, 1) + fx * (at(1, 1) - at(0, 1));
+        *value = top + fy * (bottom - top);
+    }
+}
+
+/// Light, colour, contrast, blur and noise as another camera would have them.
+fn relight(rgb: &mut [f32], side: usize, rng: &mut Pcg64Mcg) {
+    let gain = rng.random_range(0.7..1.35f32);
+    let gamma = rng.random_range(0.7..1.4f32);
+    let cast: [f32; 3] = std::array::from_fn(|_| rng.random_range(0.85..1.18f32));
+    let gray = if rng.random_bool(0.12) { 1.0 } else { rng.random_range(0.0..0.3f32) };
+    let invert_order = rng.random_bool(0.06); // red and blue exchanged: rust must not be all there is to see
+    let slope = [rng.random_range(-0.25..0.25f32), rng.random_range(-0.25..0.25f32)];
+    let noise = if rng.random_bool(0.5) { rng.random_range(0.0..7.0f32) } else { 0.0 };
+    let s = side as f32;
+    for (k, pixel) in rgb.chunks_exact_mut(3).enumerate() {
+        let (x, y) = ((k % side) as f32 / s - 0.5, (k / side) as f32 / s - 0.5);
+        let shade = gain * (1.0 + slope[0] * x + slope[1] * y);
+        let luma = 0.3 * pixel[0] + 0.59 * pixel[1] + 0.11 * pixel[2];
+        for (c, value) in pixel.iter_mut().enumerate() {
+            let v = (*value + gray * (luma - *value)) / 255.0;
+            *value = 255.0 * v.max(0.0).powf(gamma) * shade * cast[c];
+        }
+        if invert_order {
+            pixel.swap(0, 2);
+        }
+    }
+    if rng.random_bool(0.35) {
+        soften(rgb, side, rng.random_range(0.1..0.9f32));
+    } else if rng.random_bool(0.25) {
+        soften(rgb, side, -rng.random_range(0.1..0.5f32));
+    }
+    if noise > 0.0 {
+        let mut state = rng.random::<u64>();
+        for value in rgb.iter_mut() {
+            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            let part = |k: u32| ((state >> k) & 0xffff) as f32 / 65535.0 - 0.5;
+            *value += noise * 1.7 * (part(48) + part(32) + part(16));
+        }
+    }
+}
+
+/// Mixes each pixel with the mean of its neighbours; a negative share sharpens.
+fn soften(rgb: &mut [f32], side: usize, share: f32) {
+    let from = rgb.to_vec();
+    let at = |x: usize, y: usize, c: usize| from[3 * (y * side + x) + c];
+    for y in 0..side {
+        for x in 0..side {
+            let (l, r, t, b) = (x.saturating_sub(1), (x + 1).min(side - 1), y.saturating_sub(1), (y + 1).min(side - 1));
+            for c in 0..3 {
+                let mean = (at(l, y, c) + at(r, y, c) + at(x, t, c) + at(x, b, c)
+                    + 0.5 * (at(l, t, c) + at(r, t, c) + at(l, b, c) + at(r, b, c))) / 6.0;
+                rgb[3 * (y * side + x) + c] += share * (mean - at(x, y, c));
+            }
+        }
+    }
+}
+
+/// Loss and gradient over a batch: cross-entropy against sets of classes, smooth L1 for the regressions.
+pub fn loss(stage: Stage, output: &Tensor, targets: &[Target], grad: &mut Tensor) -> f32 {
+    let classes = if stage == Stage::Fine { CLASSES } else { vision::layout::COARSE_CHANNELS };
+    *grad = Tensor::zeros(output.n, output.h, output.w, output.c);
+    let total: f32 = targets.iter().filter(|t| t.classes != 0).map(|t| t.weight).sum::<f32>().max(1e-6);
+    let known = targets.iter().filter(|t| t.regression.is_some()).count().max(1) as f32;
+    let mut sum = 0.0f64;
+    let rows = output.data.chunks_exact(output.c).zip(grad.data.chunks_exact_mut(output.c));
+    for ((z, g), target) in rows.zip(targets) {
+        if target.classes != 0 {
+            let w = target.weight / total;
+            let high = z[..classes].iter().copied().fold(f32::MIN, f32::max);
+            let mut p = [0f32; CLASSES];
+            let mut norm = 0.0;
+            for c in 0..classes {
+                p[c] = (z[c] - high).exp();
+                norm += p[c];
+            }
+            let inside: f32 = (0..classes).filter(|c| target.classes >> c & 1 == 1).map(|c| p[c]).sum::<f32>().max(1e-20);
+            sum -= f64::from(w) * f64::from((inside / norm).ln());
+            for c in 0..classes {
+                let among = if target.classes >> c & 1 == 1 { p[c] / inside } else { 0.0 };
+                g[CLASS_CHANNELS.start + c] = w * (p[c] / norm - among);
+            }
+        }
+        if let Some(truth) = target.regression {
+            for (channel, (truth, (weight, knee))) in [OFFSET_U, OFFSET_V, LN_DIAMETER]
+                .into_iter()
+                .zip(truth.into_iter().zip([(6.0, 0.06), (6.0, 0.06), (0.6, 0.1)]))
+            {
+                let error = z[channel] - truth;
+                let w = weight / known;
+                if error.abs() < knee {
+                    sum += f64::from(w * 0.5 * error * error / knee);
+                    g[channel] = w * error / knee;
+                } else {
+                    sum += f64::from(w * (error.abs() - 0.5 * knee));
+                    g[channel] = w * error.signum();
+                }
+            }
+        }
+    }
+    sum as f32
+}
