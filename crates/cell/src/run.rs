@@ -42,6 +42,8 @@ impl Finder for vision::Detector {
 pub trait Observer {
     /// A step begins: its number from 0, of how many, its name.
     fn step(&self, _unit: u64, _step: usize, _of: usize, _name: &str) {}
+    /// A face was looked at; nothing on it has been touched since.
+    fn seen(&self, _unit: u64, _face: &FaceRecord) {}
     /// A screw of the face is being worked on: its number from 0, of how many.
     fn screw(&self, _screw: usize, _of: usize) {}
     /// Something worth a line.
@@ -493,6 +495,7 @@ impl Way<'_> {
         } else {
             plan::exclusion(&seen, least, &config)
         };
+        self.observer.seen(self.record.unit, &seen);
         self.log(Event::Seen { face: Box::new(seen) })?;
         match excluded {
             Some((reason, detail)) => Err(self.exclude(reason, detail)),
