@@ -158,6 +158,6 @@ pub(crate) fn surround(sheetwork: &mut Sheetwork, design: &FaceDesign, rng: &mut
                 ]
             })
             .collect();
-        sheetwork.tubes.push(Tube { points, radius, paint });
+        sheetwork.tubes.push(Tube::new(points, radius, paint));
     }
 }

@@ -243,6 +243,24 @@ pub(crate) struct Tube {
     pub points: Vec<[f32; 3]>,
     pub radius: f32,
     pub paint: Paint,
+    pub bounds: Bounds,
+    /// Lowest and highest point of its surface, mm.
+    pub heights: (f32, f32),
+}
+
+impl Tube {
+    pub fn new(points: Vec<[f32; 3]>, radius: f32, paint: Paint) -> Self {
+        let bounds = Bounds::of_points(points.iter().map(|p| [p[0], p[1]])).grown(radius);
+        let low = points.iter().map(|p| p[2]).fold(f32::MAX, f32::min);
+        let high = points.iter().map(|p| p[2]).fold(f32::MIN, f32::max);
+        Self {
+            points,
+            radius,
+            paint,
+            bounds,
+            heights: (low - radius, high + radius),
+        }
+    }
 }
 
 /// The nearest place on a piece of a tube's middle line.
@@ -252,8 +270,6 @@ pub(crate) struct TubeFoot {
     pub height: f32,
     /// From the middle line to the place, unit.
     pub across: Xy,
-    /// Arc length along the piece, mm, for textures.
-    pub along: f32,
 }
 
 /// Nearest place on one segment of a tube.
@@ -269,7 +285,6 @@ pub(crate) fn segment_foot(a: [f32; 3], b: [f32; 3], p: Xy) -> TubeFoot {
         distance,
         height: a[2] + t * (b[2] - a[2]),
         across: [dx * scale, dy * scale],
-        along: t * length2.sqrt(),
     }
 }
 

@@ -661,7 +661,7 @@ impl<'a> Draft<'a> {
                 ]
             })
             .collect();
-        self.work.tubes.push(Tube { points, radius, paint });
+        self.work.tubes.push(Tube::new(points, radius, paint));
     }
 
     fn finish(mut self, id: FaceId, width_mm: f64, height_mm: f64, next: &mut u16, rng: &mut Rng) -> FaceDesign {
@@ -1160,11 +1160,7 @@ fn loose_ends(draft: &mut Draft, chance: f64, rng: &mut Rng) {
                 [mid[0] - ny * t + nx * bow, mid[1] + nx * t + ny * bow, top]
             })
             .collect();
-        draft.work.tubes.push(Tube {
-            points,
-            radius: cord,
-            paint,
-        });
+        draft.work.tubes.push(Tube::new(points, cord, paint));
     }
 }
 

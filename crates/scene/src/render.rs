@@ -9,7 +9,7 @@ use crate::layer::{Bump, Cutout, Layer, Ray, Tube, segment_foot};
 use crate::paint::Decal;
 use crate::product::Placed;
 use crate::relief::{Material, Relief};
-use crate::shade::Lighting;
+use crate::shade::{Incoming, Lighting};
 use crate::shape::{Bounds, Xy};
 use crate::view::{FaceView, Roi};
 use geometry::{DepthMap, Pixel, RgbImage};
@@ -452,13 +452,17 @@ impl Prepared {
         }
         let mut segments = Vec::new();
         for (t, tube) in self.tubes.iter().enumerate() {
+            let (low, high) = tube.heights;
+            if !tube.bounds.meets(&seen(low, high)) {
+                continue;
+            }
             for (s, pair) in tube.points.windows(2).enumerate() {
                 let here = seen(
                     pair[0][2].min(pair[1][2]) - tube.radius,
                     pair[0][2].max(pair[1][2]) + tube.radius,
                 );
                 let bounds = Bounds::of_points(pair.iter().map(|p| [p[0], p[1]]));
-                if bounds.grown(tube.radius + 25.0).meets(&here) {
+                if bounds.grown(tube.radius + 0.2).meets(&here) {
                     segments.push((t, s));
                 }
             }
@@ -538,6 +542,10 @@ impl Prepared {
             let mut cords = Vec::new();
             if !dark {
                 for (t, tube) in self.tubes.iter().enumerate() {
+                    let above = (tube.heights.1 - low).max(0.0);
+                    if !tube.bounds.grown(half + above * (run + incoming.softness) + 1.0).meets(&here) {
+                        continue;
+                    }
                     for (s, pair) in tube.points.windows(2).enumerate() {
                         let level = pair[0][2].max(pair[1][2]) - mid;
                         if level < -play {
@@ -668,6 +676,7 @@ impl Prepared {
         let (mut material, mut normal) = self.surface(nearby, &hit);
         let mut open = 1.0;
         let mut on_spot = None;
+        let mut above_sheet = 0.0;
         for (k, (spot, relief)) in nearby.spots.iter().enumerate() {
             let base = spot.placed.height_mm as f32;
             let (x, y) = (spot.placed.at_mm[0] as f32, spot.placed.at_mm[1] as f32);
@@ -700,6 +709,7 @@ impl Prepared {
                 point = [q[0] + x, q[1] + y, base + q[2]];
             }
             on_spot = Some(k);
+            above_sheet = q[2];
             break;
         }
         open *= self.openness(shade, &hit, point);
@@ -715,15 +725,23 @@ impl Prepared {
                 if *seen <= 0.0 {
                     break;
                 }
-                let local = [
+                if on_spot.is_some_and(|s| s != k) {
+                    continue;
+                }
+                let mut local = [
                     point[0] - spot.placed.at_mm[0] as f32,
                     point[1] - spot.placed.at_mm[1] as f32,
                     point[2] - spot.placed.height_mm as f32,
                 ];
-                if on_spot.is_none() && hit.layer != spot.layer && local[2] < -1.0 || on_spot.is_some_and(|s| s != k) {
+                if hit.layer == spot.layer && hit.part == Part::Top {
+                    // the relief knows a flat sheet: heights count from the real one, seats and ribs included
+                    local[2] = above_sheet;
+                } else if local[2] < -1.0 {
                     continue;
                 }
-                *seen *= relief.visibility(local, incoming.toward, incoming.softness);
+                if in_reach(spot, relief, local, &incoming) {
+                    *seen *= relief.visibility(local, incoming.toward, incoming.softness);
+                }
             }
         }
         let count = self.lighting.lights.len().min(8);
@@ -896,6 +914,21 @@ fn crossing(high: f32, low: f32, distance: impl Fn(f32) -> f32) -> Option<f32> {
         }
     }
     Some(inside)
+}
+
+/// Whether an item can throw its shadow on a place near it: on itself, or on the sheet on the side away from the light.
+#[inline]
+fn in_reach(spot: &Spot, relief: &Relief, local: [f32; 3], light: &Incoming) -> bool {
+    let [x, y, z] = local;
+    let body = 0.58 * spot.placed.item.diameter_mm as f32 + 0.3;
+    let r2 = x * x + y * y;
+    if r2 < body * body {
+        return true;
+    }
+    let away = x * light.toward[0] + y * light.toward[1] < 0.2 * body;
+    let run = light.toward[0].hypot(light.toward[1]) / light.toward[2].max(0.05) + light.softness;
+    let reach = body + (relief.top_mm - z).max(0.0) * run;
+    away && r2 < reach * reach
 }
 
 /// Whether a place belongs to the item itself rather than to the sheet around it.
