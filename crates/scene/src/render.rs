@@ -311,6 +311,9 @@ impl Prepared {
             color: [[0.0; 3]; BLOCK * BLOCK],
             depth_mm: [0.0; BLOCK * BLOCK],
         };
+        if self.plain(&rays, &nearby, &mut out) {
+            return out;
+        }
         // First look: what each pixel's centre meets, with one pixel around to see where surfaces end.
         const WIDE: usize = BLOCK + 2;
         let nothing = Hit {
@@ -382,6 +385,91 @@ impl Prepared {
             }
         }
         out
+    }
+
+    /// Renders a block that shows nothing but the middle of one flat sheet, evenly lit: light changes slowly there, so it
+    /// is worked out at the corners only. False, and nothing done, if the block is not like that.
+    fn plain(&self, rays: &Rays, nearby: &Nearby, out: &mut Block) -> bool {
+        let [near] = nearby.layers.as_slice() else { return false };
+        let simple = near.inside && near.cutouts.is_empty() && near.is_flat();
+        if !simple || !nearby.segments.is_empty() || !nearby.spots.is_empty() {
+            return false;
+        }
+        let layer = near.layer;
+        let place = |x: f32, y: f32| {
+            let (ray, t0, dt) = rays.at(x, y);
+            let height = layer.top_mm + near.rise(ray.at_height(layer.top_mm));
+            (ray, ray.at_height(height), height, t0 - height * dt)
+        };
+        let last = (BLOCK - 1) as f32;
+        let corners = [(0.0, 0.0), (last, 0.0), (0.0, last), (last, last)].map(|(x, y)| place(x, y));
+        let mut heights = (f32::MAX, f32::MIN);
+        for (_, _, h, _) in &corners {
+            heights = (heights.0.min(*h), heights.1.max(*h));
+        }
+        let shade = self.shade(rays, heights, &[near.index], false);
+        let even = |(k, (dark, casters)): (usize, &(bool, Vec<Caster>))| {
+            *dark || shade.segments[k].is_empty() && casters.iter().all(|c| c.index == near.index)
+        };
+        if !shade.lights.iter().enumerate().all(even) {
+            return false;
+        }
+        let count = self.lighting.lights.len().min(8);
+        let mut visible = [1.0f32; 8];
+        for (seen, (dark, _)) in visible.iter_mut().zip(&shade.lights) {
+            *seen = if *dark { 0.0 } else { 1.0 };
+        }
+        let normal = unit([-near.slow.slope[0], -near.slow.slope[1], 1.0]);
+        let metal = layer.paint.metallic() > 0.0 || !near.decals.is_empty();
+        // light given off at each corner by black and grey, matt and metal: linear in both between
+        let lights = corners.map(|(ray, p, height, _)| {
+            let view = unit([ray.slope[0], ray.slope[1], 1.0]);
+            let hit = Hit {
+                height,
+                at: p,
+                layer: near.index,
+                part: Part::Top,
+            };
+            let point = [p[0], p[1], height];
+            let open = self.openness(&shade, &hit, point);
+            [(0.0, 0.0), (0.5, 0.0), (0.0, 1.0), (0.5, 1.0)].map(|(albedo, metallic)| {
+                if metallic > 0.0 && !metal {
+                    return [0.0; 3];
+                }
+                let material = Material {
+                    albedo: [albedo; 3],
+                    roughness: layer.paint.roughness,
+                    metallic,
+                };
+                self.lighting
+                    .radiance(&material, normal, view, &visible[..count], open, point)
+            })
+        });
+        for y in 0..BLOCK {
+            let fy = y as f32 / last;
+            let at = |side: usize, m: usize, k: usize| lerp(lights[side][m][k], lights[side + 2][m][k], fy);
+            let left: [[f32; 3]; 4] = std::array::from_fn(|m| std::array::from_fn(|k| at(0, m, k)));
+            let right: [[f32; 3]; 4] = std::array::from_fn(|m| std::array::from_fn(|k| at(1, m, k)));
+            for x in 0..BLOCK {
+                let fx = x as f32 / last;
+                let (_, p, _, depth) = place(x as f32, y as f32);
+                let mut material = layer.paint.at(p, 20.0);
+                for decal in &near.decals {
+                    decal.lay(p, &mut material);
+                }
+                out.color[y * BLOCK + x] = std::array::from_fn(|k| {
+                    let light = |m: usize| lerp(left[m][k], right[m][k], fx);
+                    let shine = |m: usize| light(m) + 2.0 * material.albedo[k] * (light(m + 1) - light(m));
+                    if metal {
+                        lerp(shine(0), shine(2), material.metallic)
+                    } else {
+                        shine(0)
+                    }
+                });
+                out.depth_mm[y * BLOCK + x] = depth;
+            }
+        }
+        true
     }
 
     fn nearby(&self, rays: &Rays) -> Nearby<'_> {
