@@ -408,17 +408,25 @@ impl Prepared {
             heights = (heights.0.min(*h), heights.1.max(*h));
         }
         let shade = self.shade(rays, heights, &[near.index], false);
-        let even = |(k, (dark, casters)): (usize, &(bool, Vec<Caster>))| {
-            *dark || shade.segments[k].is_empty() && casters.iter().all(|c| c.index == near.index)
+        // Shadows may cross the block if their borders are wider than it.
+        let across = {
+            let (a, b) = (corners[0].1, corners[3].1);
+            (a[0] - b[0]).hypot(a[1] - b[1])
         };
-        if !shade.lights.iter().enumerate().all(even) {
+        let even = |k: usize| {
+            let (dark, casters) = &shade.lights[k];
+            let softness = self.lighting.lights[k].at([corners[0].1[0], corners[0].1[1], heights.0]).softness;
+            let wide = |above: f32| softness * above > 0.7 * across;
+            let sheets = casters
+                .iter()
+                .all(|c| c.index == near.index || wide(c.layer.top_mm - c.layer.wall_mm.min(0.5 * (c.layer.top_mm - heights.1)) - heights.1));
+            let cords = shade.segments[k].iter().all(|&(t, _)| wide(self.tubes[t].heights.0 - heights.1));
+            *dark || sheets && cords
+        };
+        if !(0..shade.lights.len()).all(even) {
             return false;
         }
         let count = self.lighting.lights.len().min(8);
-        let mut visible = [1.0f32; 8];
-        for (seen, (dark, _)) in visible.iter_mut().zip(&shade.lights) {
-            *seen = if *dark { 0.0 } else { 1.0 };
-        }
         let normal = unit([-near.slow.slope[0], -near.slow.slope[1], 1.0]);
         let metal = layer.paint.metallic() > 0.0 || !near.decals.is_empty();
         // light given off at each corner by black and grey, matt and metal: linear in both between
@@ -432,6 +440,11 @@ impl Prepared {
             };
             let point = [p[0], p[1], height];
             let open = self.openness(&shade, &hit, point);
+            let mut visible = [1.0f32; 8];
+            for (k, (light, seen)) in self.lighting.lights.iter().zip(&mut visible).enumerate() {
+                let incoming = light.at(point);
+                *seen = self.lit(&shade, k, &hit, point, incoming.toward, incoming.softness);
+            }
             [(0.0, 0.0), (0.5, 0.0), (0.0, 1.0), (0.5, 1.0)].map(|(albedo, metallic)| {
                 if metallic > 0.0 && !metal {
                     return [0.0; 3];

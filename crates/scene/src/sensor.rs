@@ -54,7 +54,7 @@ impl Sensor {
         let mut rng = Pcg64Mcg::seed_from_u64(seed);
         let sharp = rng.random_bool(0.7);
         Self {
-            exposure: (0.5f32.ln() + rng.random::<f32>() * (1.05f32 / 0.5).ln()).exp(),
+            exposure: (0.6f32.ln() + rng.random::<f32>() * (1.25f32 / 0.6).ln()).exp(),
             blur_px: if sharp {
                 rng.random_range(0.45..0.8)
             } else {

@@ -95,7 +95,9 @@ impl FaceView {
         // What is left of the field of view around the turned face.
         let room = |field_px: f64, size: f64, other: f64| {
             let reach = 0.5 * (size * yaw_rad.cos() + other * yaw_rad.abs().sin()) * 1.05;
-            (0.5 * field_px / camera.fx_px * distance_mm - reach).max(0.0).min(140.0)
+            (0.5 * field_px / camera.fx_px * distance_mm - reach)
+                .max(0.0)
+                .min(140.0)
         };
         let (rx, ry) = (
             room(4104.0, design.width_mm, design.height_mm),
@@ -106,12 +108,16 @@ impl FaceView {
             rng.random_range(-1.0..1.0) * ry,
             distance_mm,
         ];
+        let mut sensor = Sensor::sample(rng.random());
+        let scene_seed = rng.random();
+        // The exposure is set up for the product: dark ones get more light, though not all they would need.
+        sensor.exposure *= (0.5 / design.brightness().max(0.03)).powf(0.55);
         Some(Self {
             design,
             camera,
             camera_from_face: Transform::from_parts(offset, rotation),
-            scene_seed: rng.random(),
-            sensor: Sensor::sample(rng.random()),
+            scene_seed,
+            sensor,
             removed_screws: Vec::new(),
         })
     }
@@ -124,10 +130,15 @@ impl FaceView {
     /// Where every item (screws that are still there first, then decoys) is in the picture: for choosing regions to render.
     pub fn item_pixels(&self) -> Vec<geometry::Pixel> {
         let screws = self.design.screws.iter();
-        let there = screws.filter(|s| !self.removed_screws.contains(&s.id)).map(|s| &s.placed);
+        let there = screws
+            .filter(|s| !self.removed_screws.contains(&s.id))
+            .map(|s| &s.placed);
         there
             .chain(&self.design.decoys)
-            .filter_map(|p| self.camera.project(self.camera_point(p.at_mm[0], p.at_mm[1], p.height_mm)))
+            .filter_map(|p| {
+                self.camera
+                    .project(self.camera_point(p.at_mm[0], p.at_mm[1], p.height_mm))
+            })
             .collect()
     }
 }
