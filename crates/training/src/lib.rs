@@ -5,10 +5,16 @@
 //! exact truth, `nn` to learn, `vision` for what the networks see and say.
 
 mod batch;
+mod evaluate;
 mod real;
 mod samples;
 mod train;
 mod tune;
 
+pub use evaluate::{
+    CropEvaluation, EvaluateError, Evaluation, Evaluator, FIRST_EVALUATION_SEED, Mistake, NegativeTally, PhotoEvaluation,
+    Product, ScrewTally, Share, Spread, evaluate_crops, evaluate_faces, evaluate_truth_folder, evaluate_yolo_folder,
+    truth_files, wilson,
+};
 pub use train::{Progress, TRAINING_SEEDS, TUNING_SEEDS, TrainError, TrainReport, TrainSettings, train};
 pub use tune::Tuning;
