@@ -11,6 +11,8 @@ use crate::picture::Rows;
 
 /// Two candidates of one picture are at least this far apart, in nominal head diameters.
 const APART: f64 = 0.6;
+/// More candidates than any face has: keeps the time bounded on a picture that is all texture.
+const MOST: usize = 1000;
 
 /// A place that may be a fastener's head, in the pixels of the picture that the network saw.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -63,11 +65,12 @@ pub fn coarse_map(network: &Network, picture: &RgbImage) -> ProbabilityMap {
 /// The candidates, most probable first.
 pub fn candidates(map: &ProbabilityMap, thresholds: &Thresholds) -> Vec<Candidate> {
     let inside = |x: usize, y: usize| map.probability[y * map.width + x] >= thresholds.coarse; // false for NaN
+    let smooth = smoothed(map);
     let mut found = Vec::new();
     for runs in components(map.width, map.height, inside) {
         let cells = area(&runs);
         if cells >= thresholds.coarse_min_cells.max(1) {
-            peaks(map, &runs, cells, &mut found);
+            peaks(map, &smooth, &runs, cells, &mut found);
         }
     }
     suppress(
@@ -75,20 +78,16 @@ pub fn candidates(map: &ProbabilityMap, thresholds: &Thresholds) -> Vec<Candidat
         |c| [c.pixel.u_px, c.pixel.v_px],
         |c| c.score,
         |_, _| APART * NOMINAL_HEAD_PX,
+        MOST,
     )
 }
 
 /// Adds the local maxima of the smoothed probability in a component.
-fn peaks(map: &ProbabilityMap, runs: &[Run], cells: usize, found: &mut Vec<Candidate>) {
-    let smooth = |x: usize, y: usize| {
-        let mut sum = 0.0;
-        for_square(map, x, y, 2, |_, _, p| sum += p);
-        sum / 25.0
-    };
+fn peaks(map: &ProbabilityMap, smooth: &[f32], runs: &[Run], cells: usize, found: &mut Vec<Candidate>) {
     let first = found.len();
     for run in runs {
         for x in run.start..run.end {
-            let here = smooth(x, run.y);
+            let here = smooth[run.y * map.width + x];
             let mut highest = true;
             for dy in -1..=1i64 {
                 for dx in -1..=1i64 {
@@ -96,7 +95,7 @@ fn peaks(map: &ProbabilityMap, runs: &[Run], cells: usize, found: &mut Vec<Candi
                     if (dx, dy) == (0, 0) || nx < 0 || ny < 0 || nx >= map.width as i64 || ny >= map.height as i64 {
                         continue;
                     }
-                    let there = smooth(nx as usize, ny as usize);
+                    let there = smooth[ny as usize * map.width + nx as usize];
                     // On a plateau the last cell wins, so that there is exactly one.
                     highest &= there < here || (there == here && (dy, dx) < (0, 0));
                 }
@@ -114,6 +113,30 @@ fn peaks(map: &ProbabilityMap, runs: &[Run], cells: usize, found: &mut Vec<Candi
     for candidate in &mut found[first..] {
         candidate.area_px = share;
     }
+}
+
+/// Mean over 5 x 5 cells; beyond the border there is nothing.
+fn smoothed(map: &ProbabilityMap) -> Vec<f32> {
+    const REACH: usize = 2;
+    let (width, height) = (map.width, map.height);
+    let mut across = vec![0f32; map.probability.len()];
+    for (to, from) in across
+        .chunks_exact_mut(width.max(1))
+        .zip(map.probability.chunks_exact(width.max(1)))
+    {
+        for (x, to) in to.iter_mut().enumerate() {
+            *to = from[x.saturating_sub(REACH)..(x + REACH + 1).min(width)].iter().sum();
+        }
+    }
+    let mut smooth = vec![0f32; across.len()];
+    for (y, to) in smooth.chunks_exact_mut(width.max(1)).enumerate() {
+        for row in y.saturating_sub(REACH)..(y + REACH + 1).min(height) {
+            for (to, from) in to.iter_mut().zip(&across[row * width..]) {
+                *to += from / 25.0;
+            }
+        }
+    }
+    smooth
 }
 
 /// Probability-weighted centroid of the cells around a peak.
@@ -141,12 +164,13 @@ fn for_square(map: &ProbabilityMap, x: usize, y: usize, reach: usize, mut each: 
     }
 }
 
-/// Keeps what is not nearer than `apart` to something with a higher score.
+/// Keeps what is not nearer than `apart` to something with a higher score, at most `most` of it.
 pub(crate) fn suppress<T>(
     mut items: Vec<T>,
     place: impl Fn(&T) -> [f64; 2],
     score: impl Fn(&T) -> f32,
     apart: impl Fn(&T, &T) -> f64,
+    most: usize,
 ) -> Vec<T> {
     items.sort_by(|a, b| score(b).total_cmp(&score(a))); // stable: ties keep the picture's order
     let mut kept: Vec<T> = Vec::new();
@@ -158,6 +182,9 @@ pub(crate) fn suppress<T>(
         });
         if free {
             kept.push(item);
+        }
+        if kept.len() == most {
+            break;
         }
     }
     kept
@@ -207,7 +234,7 @@ mod tests {
     #[test]
     fn suppression_keeps_the_best_of_a_crowd() {
         let crowd = vec![(0.0, 0.5f32), (3.0, 0.9), (9.0, 0.8), (30.0, 0.1)];
-        let kept = suppress(crowd, |c| [c.0, 0.0], |c| c.1, |_, _| 8.0);
+        let kept = suppress(crowd, |c| [c.0, 0.0], |c| c.1, |_, _| 8.0, 9);
         assert_eq!(kept, [(3.0, 0.9), (30.0, 0.1)]);
     }
 

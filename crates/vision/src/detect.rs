@@ -463,6 +463,7 @@ fn merge(finds: Vec<Find>) -> Vec<Find> {
         |f| [f.pixel.u_px, f.pixel.v_px],
         |f| f.evidence.fastener(),
         |a, b| SAME * a.diameter_px.min(b.diameter_px),
+        usize::MAX,
     )
 }
 
