@@ -1,2 +1,74 @@
-//! The `unscrew` command line.
-fn main() {}
+//! The `unscrew` command line: one file a subcommand, each a thin layer over the libraries.
+//!
+//! Exit codes: 0 done; 1 could not do it (the message says what, where and what to do next); 2 wrong usage; 3 done, but
+//! the result is not good enough (screws left, verification failed).
+
+mod calibrate;
+mod detect;
+mod evaluate;
+mod output;
+mod report;
+mod run;
+mod stats;
+mod synth;
+mod train;
+
+use clap::{Parser, Subcommand};
+use std::process::ExitCode;
+
+/// Finds every screw on a worn appliance, says where it is in the robot's coordinates, and takes it out.
+#[derive(Parser)]
+#[command(name = "unscrew", version, propagate_version = true, after_help = "Start with: unscrew run --units 1")]
+struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    /// Run the cell: take units apart, write journal, report and summary.
+    Run(run::Args),
+    /// Find the screws in photographs.
+    Detect(detect::Args),
+    /// Plan, capture, fit, apply and verify the map from camera to robot.
+    #[command(subcommand)]
+    Calibrate(calibrate::Command),
+    /// Measure the detector: recall, precision and centre error with confidence bounds.
+    Evaluate(evaluate::Args),
+    /// Train the detector's networks and write a model file.
+    Train(train::Args),
+    /// Render faces of outdoor units with depth and exact truth.
+    Synth(synth::Args),
+    /// Rates with bounds and times by resource, from a run's journal.
+    Stats(stats::Args),
+}
+
+/// How a command ended that did what it was asked.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Ended {
+    /// Exit code 0.
+    Good,
+    /// Exit code 3: done, but the result is not good enough.
+    NotGoodEnough,
+}
+
+fn main() -> ExitCode {
+    let cli = Cli::parse();
+    let result = match cli.command {
+        Command::Run(args) => run::run(&args),
+        Command::Detect(args) => detect::run(&args),
+        Command::Calibrate(command) => calibrate::run(&command),
+        Command::Evaluate(args) => evaluate::run(&args),
+        Command::Train(args) => train::run(&args),
+        Command::Synth(args) => synth::run(&args),
+        Command::Stats(args) => stats::run(&args),
+    };
+    match result {
+        Ok(Ended::Good) => ExitCode::SUCCESS,
+        Ok(Ended::NotGoodEnough) => ExitCode::from(3),
+        Err(error) => {
+            eprintln!("unscrew: {error:#}");
+            ExitCode::from(1)
+        }
+    }
+}

@@ -1,0 +1,234 @@
+//! `unscrew calibrate`: plan, capture, fit, apply, verify.
+
+use crate::{Ended, output};
+use anyhow::{Result, bail};
+use calibration::{Identity, Map, Method, Settings, Volume, read_pairs, read_queries, verify};
+use geometry::{Base, Point};
+use serde::Serialize;
+use std::path::PathBuf;
+
+/// From marker positions to a map from camera to robot.
+#[derive(clap::Subcommand)]
+pub enum Command {
+    /// Lattice of points for the marker, in a short tour, as CSV
+    #[command(after_help = "Example: unscrew calibrate plan --spacing-mm 50 > plan.csv")]
+    Plan(Plan),
+    /// Drive an arm with the marker over the lattice and write a pair a visit (simulated cell)
+    #[command(after_help = "Example: unscrew calibrate capture --arm arm_a --out pairs_a.csv")]
+    Capture(Capture),
+    /// Fit a map to pairs
+    #[command(after_help = "Example: unscrew calibrate fit pairs_a.csv --out map_a.json")]
+    Fit(Fit),
+    /// Map observations to the robot's base
+    #[command(after_help = "Example: unscrew calibrate apply --map map_a.json queries.csv")]
+    Apply(Apply),
+    /// Check a map against fresh pairs
+    #[command(after_help = "Example: unscrew calibrate verify --map map_a.json fresh_pairs.csv --limit-mm 0.35")]
+    Verify(Verify),
+}
+
+#[derive(clap::Args)]
+pub struct Plan {
+    /// Distance between neighbouring points, mm
+    #[arg(long, default_value_t = 50.0)]
+    spacing_mm: f64,
+    /// Opposite corners of the volume in the robot's base, mm: x,y,z,x,y,z
+    #[arg(long, value_delimiter = ',', num_args = 6, allow_hyphen_values = true, default_values_t = [950.0, -450.0, 150.0, 1350.0, 450.0, 900.0])]
+    volume_mm: Vec<f64>,
+    /// As JSON
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(clap::Args)]
+pub struct Capture {
+    /// Arm that carries the marker: arm_a or arm_b
+    #[arg(long, default_value = "arm_a")]
+    arm: String,
+    /// Distance between neighbouring points, mm
+    #[arg(long, default_value_t = 50.0)]
+    spacing_mm: f64,
+    /// Seed of the simulated cell: its robots' and lens's true errors
+    #[arg(long, default_value_t = 1)]
+    cell_seed: u64,
+    /// File of pairs; visits that it holds already are not repeated
+    #[arg(long, value_name = "FILE")]
+    out: PathBuf,
+}
+
+#[derive(clap::Args)]
+pub struct Fit {
+    /// Pairs (CSV)
+    pairs: PathBuf,
+    /// Map file to write
+    #[arg(long, value_name = "FILE")]
+    out: PathBuf,
+    /// rigid, affine or lattice (the paper's, with rejection of outliers)
+    #[arg(long, default_value = "lattice", value_parser = method)]
+    method: Method,
+    /// Exactly as published: no rejection, no fallback
+    #[arg(long)]
+    as_published: bool,
+    /// Arm that the map belongs to
+    #[arg(long, default_value = "")]
+    arm: String,
+    /// As JSON
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(clap::Args)]
+pub struct Apply {
+    /// Map file
+    #[arg(long, value_name = "FILE")]
+    map: PathBuf,
+    /// Observations: CSV with the columns of pairs, without cmd_* and q*
+    queries: PathBuf,
+    /// One JSON object a row
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(clap::Args)]
+pub struct Verify {
+    /// Map file
+    #[arg(long, value_name = "FILE")]
+    map: PathBuf,
+    /// Pairs that the map was not fitted to (CSV)
+    pairs: PathBuf,
+    /// Passes if 95 % of the 3D errors are at most this, mm
+    #[arg(long, default_value_t = 0.35)]
+    limit_mm: f64,
+    /// As JSON
+    #[arg(long)]
+    json: bool,
+}
+
+fn method(name: &str) -> Result<Method, String> {
+    [Method::Rigid, Method::Affine, Method::Lattice]
+        .into_iter()
+        .find(|m| m.name() == name)
+        .ok_or_else(|| format!("'{name}' is not one of rigid, affine, lattice"))
+}
+
+pub fn run(command: &Command) -> Result<Ended> {
+    match command {
+        Command::Plan(args) => plan(args),
+        Command::Capture(args) => capture(args),
+        Command::Fit(args) => fit(args),
+        Command::Apply(args) => apply(args),
+        Command::Verify(args) => check(args),
+    }
+}
+
+fn plan(args: &Plan) -> Result<Ended> {
+    let v = &args.volume_mm;
+    let corner = |k: usize| Point::<Base>::new(v[k], v[k + 1], v[k + 2]);
+    let targets = calibration::lattice(&Volume::between(corner(0), corner(3)), args.spacing_mm)?;
+    if args.json {
+        println!("{}", serde_json::to_string(&targets.iter().map(|t| t.command).collect::<Vec<_>>())?);
+        return Ok(Ended::Good);
+    }
+    println!("id,i,j,k,cmd_x_mm,cmd_y_mm,cmd_z_mm");
+    for t in &targets {
+        let ([i, j, k], [x, y, z]) = (t.node, t.command.to_array());
+        println!("{},{i},{j},{k},{x:.4},{y:.4},{z:.4}", t.id);
+    }
+    // the paper's robot needed 4.5 h for 2,736 points
+    eprintln!("{} points, about {:.0} minutes at the paper's 5.9 s a point", targets.len(), targets.len() as f64 * 5.92 / 60.0);
+    Ok(Ended::Good)
+}
+
+fn capture(args: &Capture) -> Result<Ended> {
+    let done = crate::run::capture_pairs(args.cell_seed, &args.arm, args.spacing_mm, &args.out)?;
+    println!(
+        "{}: {} visits, marker found at {}, {:.1} simulated hours",
+        args.out.display(),
+        done.visits,
+        done.found,
+        done.cell_s / 3600.0
+    );
+    Ok(Ended::Good)
+}
+
+fn fit(args: &Fit) -> Result<Ended> {
+    let pairs = read_pairs(&args.pairs)?;
+    let settings = Settings {
+        method: args.method,
+        as_published: args.as_published,
+        identity: Identity { arm: args.arm.clone(), camera: String::new() },
+        date: output::now_utc(),
+    };
+    let (map, report) = Map::fit(&pairs, &settings)?;
+    map.save(&args.out)?;
+    if args.json {
+        println!("{}", serde_json::to_string_pretty(&report)?);
+    } else {
+        println!("{report}\nmap written to {}", args.out.display());
+    }
+    Ok(Ended::Good)
+}
+
+#[derive(Serialize)]
+struct AppliedRow {
+    id: u64,
+    base_x_mm: Option<f64>,
+    base_y_mm: Option<f64>,
+    base_z_mm: Option<f64>,
+    sigma_lateral_mm: Option<f64>,
+    sigma_depth_mm: Option<f64>,
+    hull: Option<calibration::Hull>,
+}
+
+fn apply(args: &Apply) -> Result<Ended> {
+    let map = Map::load(&args.map)?;
+    let queries = read_queries(&args.queries)?;
+    if !args.json {
+        println!("id,base_x_mm,base_y_mm,base_z_mm,sigma_lateral_mm,sigma_depth_mm,hull");
+    }
+    for query in &queries {
+        let mapped = query.camera.filter(|_| query.valid).map(|p| map.apply(p));
+        if args.json {
+            let row = AppliedRow {
+                id: query.id,
+                base_x_mm: mapped.map(|m| m.base.x_mm()),
+                base_y_mm: mapped.map(|m| m.base.y_mm()),
+                base_z_mm: mapped.map(|m| m.base.z_mm()),
+                sigma_lateral_mm: mapped.map(|m| m.sigma_lateral_mm),
+                sigma_depth_mm: mapped.map(|m| m.sigma_depth_mm),
+                hull: mapped.map(|m| m.hull),
+            };
+            println!("{}", serde_json::to_string(&row)?);
+            continue;
+        }
+        match mapped {
+            Some(m) => println!(
+                "{},{:.4},{:.4},{:.4},{:.4},{:.4},{}",
+                query.id,
+                m.base.x_mm(),
+                m.base.y_mm(),
+                m.base.z_mm(),
+                m.sigma_lateral_mm,
+                m.sigma_depth_mm,
+                format!("{:?}", m.hull).to_lowercase()
+            ),
+            // a row without observation stays a row, so that lines never shift
+            None => println!("{},,,,,,", query.id),
+        }
+    }
+    Ok(Ended::Good)
+}
+
+fn check(args: &Verify) -> Result<Ended> {
+    if !(args.limit_mm > 0.0) {
+        bail!("--limit-mm {} is not a positive number of millimetres", args.limit_mm);
+    }
+    let map = Map::load(&args.map)?;
+    let verification = verify(&map, &read_pairs(&args.pairs)?, args.limit_mm);
+    if args.json {
+        println!("{}", serde_json::to_string_pretty(&verification)?);
+    } else {
+        println!("{verification}");
+    }
+    Ok(if verification.passed { Ended::Good } else { Ended::NotGoodEnough })
+}

@@ -1,0 +1,254 @@
+//! `unscrew detect`: the screws in photographs, as a table, as JSON lines or drawn on the picture.
+
+use crate::{Ended, output};
+use anyhow::{Context, Result, bail};
+use calibration::{Hull, Map, MappedPoint};
+use geometry::{RgbdFrame, read_camera_info, read_rgbd};
+use serde::Serialize;
+use std::{
+    io::Write,
+    ops::RangeInclusive,
+    path::{Path, PathBuf},
+    time::Instant,
+};
+use vision::{Detections, Detector, Options, Screw, Timing, Verdict};
+
+/// Finds the screws in photographs: where, how sure, which drive, and in millimetres where depth, camera and map are given.
+#[derive(clap::Args)]
+#[command(
+    after_help = "Examples:\n  unscrew detect photo.jpg --head-px 15..80 --overlay out\n  unscrew detect front.jpg --depth front.png --depth-scale 0.1 --camera camera.yaml --map map_a.json --json"
+)]
+pub struct Args {
+    /// Pictures (PNG, JPEG, TIFF)
+    #[arg(required = true)]
+    images: Vec<PathBuf>,
+    /// Depth registered to each picture: 16-bit PNG or float TIFF, in the same order
+    #[arg(long, num_args = 1..)]
+    depth: Vec<PathBuf>,
+    /// Millimetres per unit of the depth files
+    #[arg(long, default_value_t = 1.0, value_name = "MM")]
+    depth_scale: f64,
+    /// Camera intrinsics: ROS camera_info YAML (plumb_bob)
+    #[arg(long, value_name = "FILE")]
+    camera: Option<PathBuf>,
+    /// Map from camera to robot, from `unscrew calibrate fit`
+    #[arg(long, value_name = "FILE")]
+    map: Option<PathBuf>,
+    /// Head diameters to look for, px
+    #[arg(long, default_value = "20..40", value_name = "MIN..MAX", value_parser = head_range)]
+    head_px: RangeInclusive<f64>,
+    /// Model file; left out, the built-in one
+    #[arg(long, value_name = "FILE")]
+    model: Option<PathBuf>,
+    /// Write each picture with the finds drawn on it into this folder
+    #[arg(long, value_name = "DIR")]
+    overlay: Option<PathBuf>,
+    /// One JSON object a picture and line
+    #[arg(long)]
+    json: bool,
+}
+
+/// `15..80`, px.
+pub(crate) fn head_range(text: &str) -> Result<RangeInclusive<f64>, String> {
+    let parse = |t: &str| t.trim().parse::<f64>().map_err(|_| format!("'{t}' is not a number of pixels"));
+    let (low, high) = text.split_once("..").ok_or("expected MIN..MAX, such as 15..80")?;
+    let (low, high) = (parse(low)?, parse(high.trim_start_matches('='))?);
+    if !(low >= 4.0 && high >= low && high <= 2000.0) {
+        return Err(format!("{low}..{high} is no range between 4 and 2000 px"));
+    }
+    Ok(low..=high)
+}
+
+/// A line of `detect --json`, see the contract in the README: fields are added, never renamed or dropped.
+#[derive(Serialize)]
+struct Line<'a> {
+    image: &'a str,
+    width_px: u32,
+    height_px: u32,
+    model: &'a str,
+    screws: Vec<ScrewLine>,
+    timing_ms: Timing,
+}
+
+#[derive(Serialize)]
+struct ScrewLine {
+    u_px: f64,
+    v_px: f64,
+    sigma_px: f64,
+    diameter_px: f64,
+    score: f64,
+    drive: &'static str,
+    verdict: Verdict,
+    camera_mm: Option<[f64; 3]>,
+    base_mm: Option<[f64; 3]>,
+    sigma_lateral_mm: Option<f64>,
+    sigma_depth_mm: Option<f64>,
+    hull: Option<Hull>,
+    cues: Vec<String>,
+}
+
+fn rounded(value: f64, digits: i32) -> f64 {
+    let unit = 10f64.powi(digits);
+    (value * unit).round() / unit
+}
+
+fn screw_line(screw: &Screw, mapped: Option<MappedPoint>) -> ScrewLine {
+    let point = |p: [f64; 3]| p.map(|v| rounded(v, 3));
+    ScrewLine {
+        u_px: rounded(screw.pixel.u_px, 3),
+        v_px: rounded(screw.pixel.v_px, 3),
+        sigma_px: rounded(screw.sigma_px, 3),
+        diameter_px: rounded(screw.diameter_px, 2),
+        score: rounded(screw.score, 5),
+        drive: screw.drive.name(),
+        verdict: screw.verdict,
+        camera_mm: screw.camera.map(|p| point(p.to_array())),
+        base_mm: mapped.map(|m| point(m.base.to_array())),
+        // with a map: of the base point, measurement and map together; without: of the camera point
+        sigma_lateral_mm: combined(screw.sigma_lateral_mm, mapped.map(|m| m.sigma_lateral_mm)),
+        sigma_depth_mm: combined(screw.sigma_depth_mm, mapped.map(|m| m.sigma_depth_mm)),
+        hull: mapped.map(|m| m.hull),
+        cues: screw.cues.iter().map(|c| format!("{c:?}").to_lowercase()).collect(),
+    }
+}
+
+fn combined(measured: Option<f64>, map: Option<f64>) -> Option<f64> {
+    measured.map(|m| rounded(m.hypot(map.unwrap_or(0.0)), 3))
+}
+
+pub fn run(args: &Args) -> Result<Ended> {
+    if !args.depth.is_empty() && args.depth.len() != args.images.len() {
+        bail!("{} pictures but {} depth files; give one depth file for each picture", args.images.len(), args.depth.len());
+    }
+    if !(args.depth_scale > 0.0 && args.depth_scale.is_finite()) {
+        bail!("--depth-scale {} is not a positive number of millimetres a unit", args.depth_scale);
+    }
+    if args.map.is_some() && (args.camera.is_none() || args.depth.is_empty()) {
+        bail!("--map needs --depth and --camera: without them there is no point in space to map");
+    }
+    let detector = match &args.model {
+        Some(path) => Detector::load(path)?,
+        None => Detector::embedded()?,
+    };
+    if let Some(path) = &args.camera {
+        read_camera_info(path)?; // a bad camera file is said before any picture is worked on
+    }
+    let map = args.map.as_deref().map(Map::load).transpose()?;
+    if let Some(folder) = &args.overlay {
+        output::prepare_folder(folder)?;
+    }
+    let options = Options { head_px: args.head_px.clone(), ..Options::default() };
+    let stop = output::stop_on_ctrl_c();
+    let mut failed = 0;
+    let mut out = std::io::stdout().lock();
+    for (k, image) in args.images.iter().enumerate() {
+        if stop.load(std::sync::atomic::Ordering::SeqCst) {
+            bail!("stopped after {k} of {} pictures", args.images.len());
+        }
+        let depth = args.depth.get(k).map(|p| (p.as_path(), args.depth_scale));
+        // one bad picture does not cost the others
+        if let Err(error) = one(args, image, depth, &detector, &options, map.as_ref(), &mut out) {
+            if error.downcast_ref::<std::io::Error>().is_some_and(|e| e.kind() == std::io::ErrorKind::BrokenPipe) {
+                return Ok(Ended::Good);
+            }
+            eprintln!("unscrew: {error:#}");
+            failed += 1;
+        }
+    }
+    if failed > 0 {
+        bail!("{failed} of {} pictures could not be used", args.images.len());
+    }
+    Ok(Ended::Good)
+}
+
+fn one(
+    args: &Args,
+    image: &Path,
+    depth: Option<(&Path, f64)>,
+    detector: &Detector,
+    options: &Options,
+    map: Option<&Map>,
+    out: &mut impl Write,
+) -> Result<()> {
+    let begin = Instant::now();
+    let frame: RgbdFrame = read_rgbd(image, depth, args.camera.as_deref())?;
+    let decode_ms = begin.elapsed().as_secs_f64() * 1e3;
+    let mut found: Detections = detector.detect(&frame, options);
+    found.timing_ms.decode = rounded(decode_ms, 2);
+    found.timing_ms.total += decode_ms;
+    let name = image.display().to_string();
+    let mapped: Vec<Option<MappedPoint>> =
+        found.screws.iter().map(|s| s.camera.zip(map).map(|(point, map)| map.apply(point))).collect();
+    if args.json {
+        let line = Line {
+            image: &name,
+            width_px: found.size_px.0,
+            height_px: found.size_px.1,
+            model: &found.model,
+            screws: found.screws.iter().zip(&mapped).map(|(s, m)| screw_line(s, *m)).collect(),
+            timing_ms: found.timing_ms,
+        };
+        writeln!(out, "{}", serde_json::to_string(&line)?)?;
+    } else {
+        table(out, &name, &found, &mapped)?;
+    }
+    if let Some(folder) = &args.overlay {
+        let stem = image.file_stem().with_context(|| format!("{name} has no file name"))?;
+        let path = folder.join(format!("{}.jpg", stem.to_string_lossy()));
+        geometry::write_jpeg(&path, &vision::overlay(&frame.color, &found.screws), 92)?;
+    }
+    Ok(())
+}
+
+fn table(out: &mut impl Write, name: &str, found: &Detections, mapped: &[Option<MappedPoint>]) -> Result<()> {
+    let count = |v| found.screws.iter().filter(|s| s.verdict == v).count();
+    writeln!(
+        out,
+        "{name}  {} x {} px: {} screws, {} other fasteners, {} to review ({:.0} ms)",
+        found.size_px.0,
+        found.size_px.1,
+        count(Verdict::Screw),
+        count(Verdict::Other),
+        count(Verdict::Review),
+        found.timing_ms.total
+    )?;
+    if found.screws.is_empty() {
+        return Ok(());
+    }
+    writeln!(out, "  verdict  drive       score      u px      v px   ± px  head px  base x, y, z mm (or camera)")?;
+    for (screw, mapped) in found.screws.iter().zip(mapped) {
+        let place = match (mapped, screw.camera) {
+            (Some(m), _) => {
+                let [x, y, z] = m.base.to_array();
+                format!("{x:9.2} {y:9.2} {z:9.2}  {:?}", m.hull).to_lowercase()
+            }
+            (None, Some(p)) => format!("{:9.2} {:9.2} {:9.2}  camera", p.x_mm(), p.y_mm(), p.z_mm()),
+            (None, None) => "-".into(),
+        };
+        writeln!(
+            out,
+            "  {:<7}  {:<10}  {:.3}  {:8.2}  {:8.2}  {:5.2}  {:7.1}  {place}",
+            format!("{:?}", screw.verdict).to_lowercase(),
+            screw.drive.name(),
+            screw.score,
+            screw.pixel.u_px,
+            screw.pixel.v_px,
+            screw.sigma_px,
+            screw.diameter_px,
+        )?;
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn head_ranges() {
+        assert_eq!(head_range("15..80"), Ok(15.0..=80.0));
+        for bad in ["15", "80..15", "a..b", "0..5", "15..NaN"] {
+            assert!(head_range(bad).is_err(), "{bad}");
+        }
+    }
+}

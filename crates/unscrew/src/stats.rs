@@ -1,0 +1,55 @@
+//! `unscrew stats`: what a run's journal says of rates and times.
+
+use crate::Ended;
+use anyhow::Result;
+use cell::{journal::Journal, statistics::Statistics};
+use std::path::PathBuf;
+
+/// Rates with Wilson bounds over units in scope and over all, times by resource, causes; from the journal alone.
+#[derive(clap::Args)]
+#[command(after_help = "Example: unscrew stats out --json")]
+pub struct Args {
+    /// Folder of a run (holds journal.db)
+    run: PathBuf,
+    /// As JSON
+    #[arg(long)]
+    json: bool,
+}
+
+pub fn run(args: &Args) -> Result<Ended> {
+    let journal = Journal::open_read_only(&args.run)?;
+    let records = journal.records()?;
+    let statistics = Statistics::over(&records);
+    if args.json {
+        println!("{}", serde_json::to_string_pretty(&statistics)?);
+    } else {
+        print!("{}", text(&statistics));
+    }
+    Ok(Ended::Good)
+}
+
+/// The statistics as a table for a terminal.
+pub fn text(s: &Statistics) -> String {
+    let rate = |r: &cell::statistics::Rate| match r.rate {
+        Some(p) => format!("{:5.1} %  ({} of {}; 95 %: {:.1} to {:.1} %)", 100.0 * p, r.hits, r.of, 100.0 * r.low, 100.0 * r.high),
+        None => "    -".into(),
+    };
+    let time = |t: Option<f64>| t.map_or("    -".into(), |t| format!("{t:5.1} s"));
+    let mut text = format!(
+        "units      {} ({} OK, {} NG, {} excluded)\nin scope   {}\nof all     {}\nscrews out {}\nmean cycle {} (OK {}, NG {})\n",
+        s.units,
+        s.ok,
+        s.ng,
+        s.excluded,
+        rate(&s.ok_in_scope),
+        rate(&s.ok_of_all),
+        rate(&s.screws_removed),
+        time(s.cycle_mean_s),
+        time(s.cycle_ok_mean_s),
+        time(s.cycle_ng_mean_s),
+    );
+    for (cause, count) in &s.causes {
+        text.push_str(&format!("  {count:3} x {}\n", cause.replace('_', " ")));
+    }
+    text
+}
