@@ -1,10 +1,10 @@
 //! What stands around the unit: wall or floor, the magnetic table, clamps, pallets, other hardware.
 
 use crate::layer::{Layer, Sheetwork, Tube};
+use crate::noise::{Grain, Noise};
 use crate::paint::{Coat, Decal, Paint};
 use crate::product::FaceDesign;
 use crate::shape::{Bounds, Shape, Xy};
-use crate::noise::{Grain, Noise};
 use rand::RngExt;
 use rand_pcg::Pcg64Mcg;
 
@@ -31,7 +31,12 @@ pub(crate) fn surround(sheetwork: &mut Sheetwork, design: &FaceDesign, rng: &mut
         _ => (Coat::Mineral, rng.random_range(0.04..0.2), 0.9),
     };
     let color = if coat == Coat::Painted && rng.random_bool(0.4) {
-        [[0.05, 0.16, 0.1], [0.04, 0.09, 0.2], [0.5, 0.36, 0.04], [0.3, 0.05, 0.03]][rng.random_range(0..4)]
+        [
+            [0.05, 0.16, 0.1],
+            [0.04, 0.09, 0.2],
+            [0.5, 0.36, 0.04],
+            [0.3, 0.05, 0.03],
+        ][rng.random_range(0..4)]
     } else {
         gray(level, rng)
     };
@@ -82,12 +87,21 @@ pub(crate) fn surround(sheetwork: &mut Sheetwork, design: &FaceDesign, rng: &mut
         }
         let top = back + rng.random_range(8.0..(0.9 * -back).clamp(30.0, 420.0));
         let color = if rng.random_bool(0.3) {
-            [[0.6, 0.4, 0.03], [0.03, 0.12, 0.35], [0.5, 0.05, 0.03], [0.05, 0.25, 0.1]][rng.random_range(0..4)]
+            [
+                [0.6, 0.4, 0.03],
+                [0.03, 0.12, 0.35],
+                [0.5, 0.05, 0.03],
+                [0.05, 0.25, 0.1],
+            ][rng.random_range(0..4)]
         } else {
             let level = rng.random_range(0.05..0.6);
             gray(level, rng)
         };
-        let coat = if rng.random_bool(0.4) { Coat::Zinc } else { Coat::Painted };
+        let coat = if rng.random_bool(0.4) {
+            Coat::Zinc
+        } else {
+            Coat::Painted
+        };
         let paint = Paint::new(coat, color, rng.random_range(0.3..0.8), rng).worn(
             rng.random_range(0.0..0.6),
             mud,
@@ -129,9 +143,15 @@ pub(crate) fn surround(sheetwork: &mut Sheetwork, design: &FaceDesign, rng: &mut
         let across = rng.random_bool(0.5);
         let t = rng.random_range(-0.7..0.7f32);
         let (center, size) = if across {
-            ([sign * (half[0] + reach), t * half[1]], [reach, rng.random_range(15.0..50.0)])
+            (
+                [sign * (half[0] + reach), t * half[1]],
+                [reach, rng.random_range(15.0..50.0)],
+            )
         } else {
-            ([t * half[0], sign * (half[1] + reach)], [rng.random_range(15.0..60.0), reach])
+            (
+                [t * half[0], sign * (half[1] + reach)],
+                [rng.random_range(15.0..60.0), reach],
+            )
         };
         let level = rng.random_range(0.1..0.6);
         let color = gray(level, rng);
@@ -151,11 +171,7 @@ pub(crate) fn surround(sheetwork: &mut Sheetwork, design: &FaceDesign, rng: &mut
         let points = (0..=30)
             .map(|k| {
                 let t = k as f32 / 30.0;
-                [
-                    from[0] + bend * (3.0 * t).sin(),
-                    from[1] + 1800.0 * t,
-                    back + radius,
-                ]
+                [from[0] + bend * (3.0 * t).sin(), from[1] + 1800.0 * t, back + radius]
             })
             .collect();
         sheetwork.tubes.push(Tube::new(points, radius, paint));

@@ -5,9 +5,7 @@ use crate::layer::{Bump, Layer, Sheetwork, Tube};
 use crate::noise::{Grain, Noise};
 use crate::paint::{Coat, Decal, Paint};
 use crate::print::Print;
-use crate::product::{
-    Cover, CoverId, Exclusion, FaceDesign, FaceId, Placed, Screw, ScrewId, Theme, Unit, UnitOptions,
-};
+use crate::product::{Cover, CoverId, Exclusion, FaceDesign, FaceId, Placed, Screw, ScrewId, Theme, Unit, UnitOptions};
 use crate::shape::{Bounds, Shape, Xy};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
@@ -71,9 +69,17 @@ impl Style {
             78..92 => Theme::Chalky,
             _ => Theme::Greasy,
         };
-        let panel_choice = if rng.random_bool(0.72) { rng.random_range(0..6) } else { rng.random_range(0..PANELS.len()) };
+        let panel_choice = if rng.random_bool(0.72) {
+            rng.random_range(0..6)
+        } else {
+            rng.random_range(0..PANELS.len())
+        };
         let panel = varied(PANELS[panel_choice], 0.12, rng);
-        let trim = if rng.random_bool(0.6) { panel } else { varied(pick(rng, &PANELS), 0.1, rng) };
+        let trim = if rng.random_bool(0.6) {
+            panel
+        } else {
+            varied(pick(rng, &PANELS), 0.1, rng)
+        };
         let (dirt, rust) = match theme {
             Theme::Clean => (rng.random_range(0.03..0.2), rng.random_range(0.0..0.06)),
             Theme::Dusty => (rng.random_range(0.35..0.85), rng.random_range(0.0..0.25)),
@@ -93,8 +99,26 @@ impl Style {
             },
             theme,
             scale: options.wear,
-            head: pick(rng, &[Head::Pan, Head::Pan, Head::Truss, Head::Binding, Head::Washer, Head::HexFlange]),
-            recess: pick(rng, &[CrossRecess::Jis, CrossRecess::Phillips, CrossRecess::Phillips, CrossRecess::Combination]),
+            head: pick(
+                rng,
+                &[
+                    Head::Pan,
+                    Head::Pan,
+                    Head::Truss,
+                    Head::Binding,
+                    Head::Washer,
+                    Head::HexFlange,
+                ],
+            ),
+            recess: pick(
+                rng,
+                &[
+                    CrossRecess::Jis,
+                    CrossRecess::Phillips,
+                    CrossRecess::Phillips,
+                    CrossRecess::Combination,
+                ],
+            ),
             plating: pick(
                 rng,
                 &[
@@ -128,16 +152,23 @@ impl Style {
     }
 
     fn paint(&self, rng: &mut Rng) -> Paint {
-        Paint::new(Coat::Painted, varied(self.panel, 0.015, rng), self.roughness, rng).worn(self.dirt, self.mud, self.rust, rng)
+        Paint::new(Coat::Painted, varied(self.panel, 0.015, rng), self.roughness, rng)
+            .worn(self.dirt, self.mud, self.rust, rng)
     }
 
     fn trim(&self, rng: &mut Rng) -> Paint {
-        Paint::new(Coat::Painted, varied(self.trim, 0.02, rng), self.roughness, rng).worn(self.dirt, self.mud, self.rust, rng)
+        Paint::new(Coat::Painted, varied(self.trim, 0.02, rng), self.roughness, rng)
+            .worn(self.dirt, self.mud, self.rust, rng)
     }
 
     fn zinc(&self, rng: &mut Rng) -> Paint {
-        Paint::new(Coat::Zinc, varied([0.62, 0.64, 0.66], 0.1, rng), rng.random_range(0.35..0.6), rng)
-            .worn((self.dirt + 0.1).min(1.0), self.mud, (1.4 * self.rust).min(1.0), rng)
+        Paint::new(
+            Coat::Zinc,
+            varied([0.62, 0.64, 0.66], 0.1, rng),
+            rng.random_range(0.35..0.6),
+            rng,
+        )
+        .worn((self.dirt + 0.1).min(1.0), self.mud, (1.4 * self.rust).min(1.0), rng)
     }
 
     fn plastic(&self, albedo: [f32; 3], rng: &mut Rng) -> Paint {
@@ -155,12 +186,54 @@ impl Style {
         };
         // (rust, white rust, dirt, dust, mud, paint): mean and how many have it at all
         let t = match self.theme {
-            Theme::Clean => [(0.08, 0.25), (0.08, 0.2), (0.1, 0.4), (0.12, 0.5), (0.05, 0.05), (0.0, 0.0)],
-            Theme::Dusty => [(0.15, 0.35), (0.15, 0.3), (0.35, 0.8), (0.5, 0.9), (0.2, 0.3), (0.0, 0.0)],
-            Theme::Coastal => [(0.55, 0.9), (0.35, 0.5), (0.25, 0.6), (0.15, 0.4), (0.15, 0.2), (0.0, 0.0)],
-            Theme::Muddy => [(0.25, 0.5), (0.15, 0.3), (0.5, 0.9), (0.35, 0.6), (0.35, 0.65), (0.0, 0.0)],
-            Theme::Repainted => [(0.15, 0.3), (0.1, 0.2), (0.15, 0.5), (0.15, 0.5), (0.1, 0.15), (0.45, 0.75)],
-            Theme::Chalky => [(0.15, 0.4), (0.5, 0.85), (0.2, 0.5), (0.35, 0.7), (0.1, 0.15), (0.0, 0.0)],
+            Theme::Clean => [
+                (0.08, 0.25),
+                (0.08, 0.2),
+                (0.1, 0.4),
+                (0.12, 0.5),
+                (0.05, 0.05),
+                (0.0, 0.0),
+            ],
+            Theme::Dusty => [
+                (0.15, 0.35),
+                (0.15, 0.3),
+                (0.35, 0.8),
+                (0.5, 0.9),
+                (0.2, 0.3),
+                (0.0, 0.0),
+            ],
+            Theme::Coastal => [
+                (0.55, 0.9),
+                (0.35, 0.5),
+                (0.25, 0.6),
+                (0.15, 0.4),
+                (0.15, 0.2),
+                (0.0, 0.0),
+            ],
+            Theme::Muddy => [
+                (0.25, 0.5),
+                (0.15, 0.3),
+                (0.5, 0.9),
+                (0.35, 0.6),
+                (0.35, 0.65),
+                (0.0, 0.0),
+            ],
+            Theme::Repainted => [
+                (0.15, 0.3),
+                (0.1, 0.2),
+                (0.15, 0.5),
+                (0.15, 0.5),
+                (0.1, 0.15),
+                (0.45, 0.75),
+            ],
+            Theme::Chalky => [
+                (0.15, 0.4),
+                (0.5, 0.85),
+                (0.2, 0.5),
+                (0.35, 0.7),
+                (0.1, 0.15),
+                (0.0, 0.0),
+            ],
             Theme::Greasy => [(0.1, 0.3), (0.1, 0.2), (0.6, 0.95), (0.2, 0.4), (0.35, 0.6), (0.0, 0.0)],
         };
         Wear {
@@ -181,8 +254,14 @@ impl Style {
         let odd = rng.random_bool(0.22);
         let (head, recess, plating) = if odd {
             (
-                pick(rng, &[Head::Pan, Head::Truss, Head::Binding, Head::Washer, Head::HexFlange]),
-                pick(rng, &[CrossRecess::Jis, CrossRecess::Phillips, CrossRecess::Combination]),
+                pick(
+                    rng,
+                    &[Head::Pan, Head::Truss, Head::Binding, Head::Washer, Head::HexFlange],
+                ),
+                pick(
+                    rng,
+                    &[CrossRecess::Jis, CrossRecess::Phillips, CrossRecess::Combination],
+                ),
                 pick(
                     rng,
                     &[
@@ -200,7 +279,11 @@ impl Style {
         } else {
             (self.head, self.recess, self.plating)
         };
-        let base = if odd { rng.random_range(7.0..12.0) } else { self.diameter_mm };
+        let base = if odd {
+            rng.random_range(7.0..12.0)
+        } else {
+            self.diameter_mm
+        };
         let wide = match head {
             Head::Pan => 0.92,
             Head::Binding => 0.97,
@@ -394,7 +477,10 @@ impl<'a> Draft<'a> {
         let level = own.height(at);
         let flat = (0..8).all(|k| {
             let angle = k as f32 * std::f32::consts::FRAC_PI_4;
-            let p = [at[0] + (radius + 1.0) * angle.cos(), at[1] + (radius + 1.0) * angle.sin()];
+            let p = [
+                at[0] + (radius + 1.0) * angle.cos(),
+                at[1] + (radius + 1.0) * angle.sin(),
+            ];
             (own.height(p) - level).abs() < 0.25
         });
         let covered = work
@@ -405,7 +491,11 @@ impl<'a> Draft<'a> {
             .taken
             .iter()
             .any(|(p, r)| (p[0] - at[0]).hypot(p[1] - at[1]) < r + radius + 5.0);
-        let labelled = !on_label && self.labels.iter().any(|b| b.meets(&Bounds::around(at, [radius + 1.0; 2])));
+        let labelled = !on_label
+            && self
+                .labels
+                .iter()
+                .any(|b| b.meets(&Bounds::around(at, [radius + 1.0; 2])));
         flat && !covered && !crowded && !labelled
     }
 
@@ -421,7 +511,9 @@ impl<'a> Draft<'a> {
                 let (low, high) = (site.within.low[k] + radius + 2.0, site.within.high[k] - radius - 2.0);
                 (high > low).then(|| rng.random_range(low..high))
             };
-            let (Some(x), Some(y)) = (room(0, rng), room(1, rng)) else { continue };
+            let (Some(x), Some(y)) = (room(0, rng), room(1, rng)) else {
+                continue;
+            };
             if self.free(site.layer, [x, y], radius, on_label) {
                 return Some((site.layer, [x, y]));
             }
@@ -501,7 +593,9 @@ impl<'a> Draft<'a> {
             let item = self.style.decoy(rng);
             let radius = 0.5 * item.diameter_mm as f32;
             let printed = item.kind == Kind::Decoy(Decoy::PrintedMark);
-            let Some((layer, at)) = self.find(&sites, radius, printed, rng) else { continue };
+            let Some((layer, at)) = self.find(&sites, radius, printed, rng) else {
+                continue;
+            };
             if matches!(item.kind, Kind::Decoy(k) if k.drive().is_some()) {
                 self.seat(layer, at, radius, rng);
             }
@@ -524,10 +618,22 @@ impl<'a> Draft<'a> {
                 let (low, high) = (within.low[k] + half + 3.0, within.high[k] - half - 3.0);
                 (high > low).then(|| rng.random_range(low..high))
             };
-            let (Some(x), Some(y)) = (room(0, w, rng), room(1, h, rng)) else { return };
+            let (Some(x), Some(y)) = (room(0, w, rng), room(1, h, rng)) else {
+                return;
+            };
             let bounds = Bounds::around([x, y], [w, h]);
             let own = &self.work.layers[layer];
-            let corners = [[-w, -h], [w, -h], [-w, h], [w, h], [0.0, 0.0], [0.0, h], [w, 0.0], [-w, 0.0], [0.0, -h]];
+            let corners = [
+                [-w, -h],
+                [w, -h],
+                [-w, h],
+                [w, h],
+                [0.0, 0.0],
+                [0.0, h],
+                [w, 0.0],
+                [-w, 0.0],
+                [0.0, -h],
+            ];
             let level = own.height([x, y]);
             let clear = corners.iter().all(|c| {
                 let p = [x + c[0], y + c[1]];
@@ -565,7 +671,9 @@ impl<'a> Draft<'a> {
                 rng.random_range(within.low[1]..within.high[1]),
             ]
         };
-        let count = |mean: f32, rng: &mut Rng| (mean * area.min(1.0) * style.scale.min(1.5) * rng.random_range(0.3..1.7)) as usize;
+        let count = |mean: f32, rng: &mut Rng| {
+            (mean * area.min(1.0) * style.scale.min(1.5) * rng.random_range(0.3..1.7)) as usize
+        };
         for _ in 0..count(4.0 + 14.0 * style.dirt, rng) {
             let mut from = place(rng);
             if rng.random_bool(0.5) {
@@ -596,7 +704,11 @@ impl<'a> Draft<'a> {
                 Decal::Stain {
                     center: place(rng),
                     radius: rng.random_range(4.0..70.0),
-                    color: if rng.random_bool(0.2) { [0.6, 0.58, 0.52] } else { style.mud },
+                    color: if rng.random_bool(0.2) {
+                        [0.6, 0.58, 0.52]
+                    } else {
+                        style.mud
+                    },
                     strength: rng.random_range(0.1..0.75) * (0.25 + style.dirt),
                     ragged,
                 },
@@ -604,7 +716,10 @@ impl<'a> Draft<'a> {
         }
         for _ in 0..count(9.0, rng) {
             let from = place(rng);
-            let (angle, length) = (rng.random_range(0.0..std::f32::consts::TAU), rng.random_range(5.0..90.0f32));
+            let (angle, length) = (
+                rng.random_range(0.0..std::f32::consts::TAU),
+                rng.random_range(5.0..90.0f32),
+            );
             let bright = rng.random_bool(0.5);
             self.decal(
                 layer,
@@ -631,7 +746,11 @@ impl<'a> Draft<'a> {
         let waves = std::array::from_fn(|_| {
             let k = std::f32::consts::TAU / rng.random_range(120.0..500.0f32);
             let angle = rng.random_range(0.0..std::f32::consts::TAU);
-            [k * angle.cos(), k * angle.sin(), rng.random_range(0.0..6.28)]
+            [
+                k * angle.cos(),
+                k * angle.sin(),
+                rng.random_range(0.0..std::f32::consts::TAU),
+            ]
         });
         let bounds = self.work.layers[layer].bounds;
         let amplitude = rng.random_range(0.05..0.3);
@@ -676,7 +795,8 @@ impl<'a> Draft<'a> {
                 let id = ScrewId(*next);
                 *next += 1;
                 let w = &placed.item.wear;
-                let torque_nm = rng.random_range(1.2..2.2) * (1.0 + 1.1 * f64::from(w.rust) + 0.5 * f64::from(w.paint_over));
+                let torque_nm =
+                    rng.random_range(1.2..2.2) * (1.0 + 1.1 * f64::from(w.rust) + 0.5 * f64::from(w.paint_over));
                 Screw {
                     id,
                     placed,
@@ -733,11 +853,25 @@ fn body(draft: &mut Draft, depth_mm: f32, rng: &mut Rng) -> (usize, f32, f32) {
     ));
     draft.seam(top, bounds([-w + 6.0, -h], [w - 6.0, -h + top_skirt]));
     let bottom_skirt = rng.random_range(16.0..34.0f32);
-    let paint = if rng.random_bool(0.5) { draft.style.zinc(rng) } else { draft.style.trim(rng) };
+    let paint = if rng.random_bool(0.5) {
+        draft.style.zinc(rng)
+    } else {
+        draft.style.trim(rng)
+    };
     let rises = rng.random_bool(0.6);
-    let level = if rises { rng.random_range(0.8..1.8) } else { -rng.random_range(1.0..4.0) };
+    let level = if rises {
+        rng.random_range(0.8..1.8)
+    } else {
+        -rng.random_range(1.0..4.0)
+    };
     let bottom = if rises {
-        let l = draft.add(Layer::new(strip([-w, h - bottom_skirt], [w, h]), level, 40.0, 0.8, paint));
+        let l = draft.add(Layer::new(
+            strip([-w, h - bottom_skirt], [w, h]),
+            level,
+            40.0,
+            0.8,
+            paint,
+        ));
         draft.seam(l, bounds([-w + 6.0, h - bottom_skirt], [w - 6.0, h]));
         l
     } else {
@@ -779,7 +913,10 @@ fn body(draft: &mut Draft, depth_mm: f32, rng: &mut Rng) -> (usize, f32, f32) {
                         soft: 1.0,
                     },
                 );
-                draft.seam(base, bounds([low + 2.0, -h + top_skirt + 2.0], [high - 2.0, h - bottom_skirt - 2.0]));
+                draft.seam(
+                    base,
+                    bounds([low + 2.0, -h + top_skirt + 2.0], [high - 2.0, h - bottom_skirt - 2.0]),
+                );
             }
         }
     }
@@ -922,7 +1059,10 @@ fn front(style: &Style, w: f64, h: f64, depth: f64, next: &mut u16, rng: &mut Rn
     let mid_y = 0.5 * (y_low + y_high);
     let radius = (0.46 * room_y).min(0.62 * hw) * rng.random_range(0.82..0.98);
     let side = if rng.random_bool(0.8) { -1.0 } else { 1.0 };
-    let center = [side * (hw - radius - rng.random_range(28.0..60.0)), mid_y + rng.random_range(-8.0..8.0)];
+    let center = [
+        side * (hw - radius - rng.random_range(28.0..60.0)),
+        mid_y + rng.random_range(-8.0..8.0),
+    ];
     // opening with a pressed ring around it
     draft.bump(
         base,
@@ -949,14 +1089,18 @@ fn front(style: &Style, w: f64, h: f64, depth: f64, next: &mut u16, rng: &mut Rn
         0.0,
         shroud,
     ));
-    let blade_color = if rng.random_bool(0.4) { [0.35; 3] } else { [0.07, 0.07, 0.075] };
+    let blade_color = if rng.random_bool(0.4) {
+        [0.35; 3]
+    } else {
+        [0.07, 0.07, 0.075]
+    };
     let blades = style.plastic(varied(blade_color, 0.3, rng), rng);
     let fan_top = -rng.random_range(45.0..75.0f32);
     draft.add(Layer::new(
         Shape::Spokes {
             center,
             count: rng.random_range(3..=5),
-            phase: rng.random_range(0.0..6.28),
+            phase: rng.random_range(0.0..std::f32::consts::TAU),
             inner: 0.1 * radius,
             outer: 0.93 * radius,
             half_width: 0.2 * radius,
@@ -979,7 +1123,10 @@ fn front(style: &Style, w: f64, h: f64, depth: f64, next: &mut u16, rng: &mut Rn
     ));
     // guard
     let guard = if rng.random_bool(0.6) {
-        style.plastic(varied(if rng.random_bool(0.5) { style.panel } else { [0.08; 3] }, 0.05, rng), rng)
+        style.plastic(
+            varied(if rng.random_bool(0.5) { style.panel } else { [0.08; 3] }, 0.05, rng),
+            rng,
+        )
     } else {
         style.trim(rng)
     };
@@ -1007,7 +1154,7 @@ fn front(style: &Style, w: f64, h: f64, depth: f64, next: &mut u16, rng: &mut Rn
                 Shape::Spokes {
                     center,
                     count: rng.random_range(4..=12),
-                    phase: rng.random_range(0.0..6.28),
+                    phase: rng.random_range(0.0..std::f32::consts::TAU),
                     inner: 0.8 * first,
                     outer: radius + 6.0,
                     half_width: 1.3 * wire,
@@ -1018,7 +1165,13 @@ fn front(style: &Style, w: f64, h: f64, depth: f64, next: &mut u16, rng: &mut Rn
                 1.2 * wire,
                 guard.clone(),
             ));
-            draft.add(Layer::new(Shape::Disc { center, radius: first }, lift + 0.4, 3.0, 2.0, guard));
+            draft.add(Layer::new(
+                Shape::Disc { center, radius: first },
+                lift + 0.4,
+                3.0,
+                2.0,
+                guard,
+            ));
         }
         1 => {
             draft.add(Layer::new(
@@ -1051,7 +1204,13 @@ fn front(style: &Style, w: f64, h: f64, depth: f64, next: &mut u16, rng: &mut Rn
                 guard.clone(),
             ));
             let cap = 0.24 * radius;
-            draft.add(Layer::new(Shape::Disc { center, radius: cap }, lift + 0.6, 4.0, 3.0, guard));
+            draft.add(Layer::new(
+                Shape::Disc { center, radius: cap },
+                lift + 0.6,
+                4.0,
+                3.0,
+                guard,
+            ));
         }
         _ => {
             let pitch = rng.random_range(12.0..26.0);
@@ -1119,10 +1278,23 @@ fn loose_ends(draft: &mut Draft, chance: f64, rng: &mut Rng) {
     let [w, h] = draft.half;
     if rng.random_bool(chance) {
         for _ in 0..rng.random_range(1..=2) {
-            let color = pick(rng, &[[0.03; 3], [0.75, 0.75, 0.72], [0.5, 0.04, 0.04], [0.04, 0.12, 0.45], [0.3; 3]]);
+            let color = pick(
+                rng,
+                &[
+                    [0.03; 3],
+                    [0.75, 0.75, 0.72],
+                    [0.5, 0.04, 0.04],
+                    [0.04, 0.12, 0.45],
+                    [0.3; 3],
+                ],
+            );
             let paint = draft.style.plastic(color, rng);
             let x = rng.random_range(-w..w);
-            let to = [x + rng.random_range(-200.0..200.0), rng.random_range(-0.2 * h..1.1 * h), 4.0];
+            let to = [
+                x + rng.random_range(-200.0..200.0),
+                rng.random_range(-0.2 * h..1.1 * h),
+                4.0,
+            ];
             let radius = rng.random_range(1.2..4.5);
             draft.tube([x, -h - 20.0, 6.0], to, 30.0, radius, paint, rng);
         }
@@ -1151,7 +1323,16 @@ fn loose_ends(draft: &mut Draft, chance: f64, rng: &mut Rng) {
         let mid = [at[0] + off * nx, at[1] + off * ny];
         let top = screw.height_mm as f32 + 5.0 + cord;
         let reach = rng.random_range(30.0..120.0);
-        let color = pick(rng, &[[0.03; 3], [0.7, 0.7, 0.66], [0.5, 0.05, 0.04], [0.05, 0.15, 0.5], [0.6, 0.5, 0.06]]);
+        let color = pick(
+            rng,
+            &[
+                [0.03; 3],
+                [0.7, 0.7, 0.66],
+                [0.5, 0.05, 0.04],
+                [0.05, 0.15, 0.5],
+                [0.6, 0.5, 0.06],
+            ],
+        );
         let paint = draft.style.plastic(color, rng);
         let points = (0..=16)
             .map(|i| {
@@ -1173,10 +1354,14 @@ fn side(style: &Style, id: FaceId, d: f64, h: f64, width: f64, next: &mut u16, r
     let mut free = inner;
     if id == FaceId::Left && rng.random_bool(0.5) && iw > 80.0 {
         // the heat exchanger behind its guard
-        let half = [0.5 * iw * rng.random_range(0.6..0.95), 0.5 * ih * rng.random_range(0.5..0.85)];
+        let half = [
+            0.5 * iw * rng.random_range(0.6..0.95),
+            0.5 * ih * rng.random_range(0.5..0.85),
+        ];
         let center = [0.5 * (inner.low[0] + inner.high[0]), inner.low[1] + half[1] + 4.0];
         draft.work.layers[base].cut(Shape::rect(center, half, 4.0), 10.0);
-        let fins = Paint::new(Coat::Zinc, [0.4, 0.42, 0.44], 0.55, rng).worn(style.dirt, style.mud, 0.2 * style.rust, rng);
+        let fins =
+            Paint::new(Coat::Zinc, [0.4, 0.42, 0.44], 0.55, rng).worn(style.dirt, style.mud, 0.2 * style.rust, rng);
         let shape = Shape::rect(center, [half[0] + 8.0, half[1] + 8.0], 0.0);
         let mut layer = Layer::new(shape.clone(), -12.0, 0.0, 0.0, fins);
         layer.bumps.push(Bump::Wave {
@@ -1187,7 +1372,11 @@ fn side(style: &Style, id: FaceId, d: f64, h: f64, width: f64, next: &mut u16, r
         });
         draft.add(layer);
         if rng.random_bool(0.7) {
-            let guard = if rng.random_bool(0.5) { style.zinc(rng) } else { style.plastic([0.07; 3], rng) };
+            let guard = if rng.random_bool(0.5) {
+                style.zinc(rng)
+            } else {
+                style.plastic([0.07; 3], rng)
+            };
             let pitch = rng.random_range(14.0..34.0);
             let wire = rng.random_range(0.8..1.6);
             draft.add(Layer::new(
@@ -1207,7 +1396,10 @@ fn side(style: &Style, id: FaceId, d: f64, h: f64, width: f64, next: &mut u16, r
         free = bounds([inner.low[0], center[1] + half[1] + 4.0], inner.high);
     } else if id == FaceId::Right && rng.random_bool(0.75) && iw > 90.0 {
         // valve cover: a box standing out, with its own flange
-        let half = [0.5 * iw * rng.random_range(0.5..0.8), 0.5 * ih * rng.random_range(0.25..0.45)];
+        let half = [
+            0.5 * iw * rng.random_range(0.5..0.8),
+            0.5 * ih * rng.random_range(0.25..0.45),
+        ];
         let center = [
             0.5 * (inner.low[0] + inner.high[0]) + rng.random_range(-0.08..0.08) * iw,
             inner.high[1] - half[1] - rng.random_range(4.0..0.3 * ih),
@@ -1245,9 +1437,20 @@ fn side(style: &Style, id: FaceId, d: f64, h: f64, width: f64, next: &mut u16, r
             let x = center[0] + (k as f32 - 0.5) * rng.random_range(24.0..40.0);
             let copper = Paint::new(Coat::Zinc, [0.6, 0.32, 0.17], 0.4, rng).worn(style.dirt, style.mud, 0.0, rng);
             let radius = rng.random_range(4.0..8.0);
-            let paint = if rng.random_bool(0.5) { copper } else { style.plastic([0.7; 3], rng) };
+            let paint = if rng.random_bool(0.5) {
+                copper
+            } else {
+                style.plastic([0.7; 3], rng)
+            };
             let low = center[1] + half[1];
-            draft.tube([x, low - 5.0, 12.0], [x + 30.0, draft.half[1] + 60.0, 25.0], 0.0, radius, paint, rng);
+            draft.tube(
+                [x, low - 5.0, 12.0],
+                [x + 30.0, draft.half[1] + 60.0, 25.0],
+                0.0,
+                radius,
+                paint,
+                rng,
+            );
         }
     }
     let (fw, fh) = (free.high[0] - free.low[0], free.high[1] - free.low[1]);
@@ -1326,9 +1529,19 @@ fn front_inner(style: &Style, w: f64, h: f64, depth: f64, next: &mut u16, rng: &
     let mut draft = Draft::new(style, w, h);
     let [hw, hh] = draft.half;
     // frame
-    let paint = if rng.random_bool(0.6) { style.zinc(rng) } else { style.trim(rng) };
+    let paint = if rng.random_bool(0.6) {
+        style.zinc(rng)
+    } else {
+        style.trim(rng)
+    };
     let rim: [f32; 4] = std::array::from_fn(|_| rng.random_range(18.0..40.0));
-    let frame = draft.add(Layer::new(Shape::rect([0.0, 0.0], [hw, hh], 3.0), 0.0, 60.0, 1.5, paint));
+    let frame = draft.add(Layer::new(
+        Shape::rect([0.0, 0.0], [hw, hh], 3.0),
+        0.0,
+        60.0,
+        1.5,
+        paint,
+    ));
     let (low, high) = ([-hw + rim[0], -hh + rim[1]], [hw - rim[2], hh - rim[3]]);
     draft.work.layers[frame].cut(strip(low, high), depth.min(90.0) as f32);
     draft.seam(frame, bounds([-hw + 4.0, -hh + 1.0], [hw - 4.0, -hh + rim[1]]));
@@ -1338,7 +1551,12 @@ fn front_inner(style: &Style, w: f64, h: f64, depth: f64, next: &mut u16, rng: &
     // back: heat exchanger fins or dark sheet
     let back = -rng.random_range(130.0..0.75 * depth) as f32;
     let grey = rng.random_range(0.06..0.22f32);
-    let paint = Paint::new(Coat::Plastic, [grey, grey, 1.03 * grey], 0.75, rng).worn(style.dirt, style.mud, 0.4 * style.rust, rng);
+    let paint = Paint::new(Coat::Plastic, [grey, grey, 1.03 * grey], 0.75, rng).worn(
+        style.dirt,
+        style.mud,
+        0.4 * style.rust,
+        rng,
+    );
     let mut floor = Layer::new(strip([-hw, -hh], [hw, hh]), back, 0.0, 0.0, paint);
     if rng.random_bool(0.6) {
         floor.bumps.push(Bump::Wave {
@@ -1409,7 +1627,16 @@ fn front_inner(style: &Style, w: f64, h: f64, depth: f64, next: &mut u16, rng: &
     ));
     let _ = body;
     let shaft = Paint::new(Coat::Zinc, [0.6; 3], 0.3, rng);
-    draft.add(Layer::new(Shape::Disc { center: mid, radius: 5.0 }, mount + 50.0, 26.0, 1.0, shaft));
+    draft.add(Layer::new(
+        Shape::Disc {
+            center: mid,
+            radius: 5.0,
+        },
+        mount + 50.0,
+        26.0,
+        1.0,
+        shaft,
+    ));
     // compressor room: electrical box above, compressor below
     let room = [split + 10.0, high[0]];
     let box_height = rng.random_range(0.3..0.5) * (high[1] - low[1]);
@@ -1420,7 +1647,13 @@ fn front_inner(style: &Style, w: f64, h: f64, depth: f64, next: &mut u16, rng: &
     };
     let box_low = [room[0] + 3.0, low[1] + rng.random_range(4.0..20.0)];
     let box_high = [room[1] - rng.random_range(3.0..20.0), box_low[1] + box_height];
-    let lid = draft.add(Layer::new(strip(box_low, box_high), -rng.random_range(6.0..40.0f32), 50.0, 3.0, paint));
+    let lid = draft.add(Layer::new(
+        strip(box_low, box_high),
+        -rng.random_range(6.0..40.0f32),
+        50.0,
+        3.0,
+        paint,
+    ));
     let on = bounds(box_low, box_high);
     draft.seam(lid, on);
     draft.panel(lid, on);
@@ -1606,7 +1839,11 @@ pub(crate) fn gauge(seed: u64) -> Unit {
     style.theme = Theme::Clean;
     let size_mm = [rng.random_range(420.0..640.0), 20.0, rng.random_range(300.0..460.0)];
     let mut draft = Draft::new(&style, size_mm[0], size_mm[2]);
-    let paint = if rng.random_bool(0.5) { style.zinc(&mut rng) } else { style.paint(&mut rng) };
+    let paint = if rng.random_bool(0.5) {
+        style.zinc(&mut rng)
+    } else {
+        style.paint(&mut rng)
+    };
     let [w, h] = draft.half;
     let plate = draft.add(Layer::new(Shape::rect([0.0, 0.0], [w, h], 4.0), 0.0, 20.0, 1.0, paint));
     draft.seam(plate, bounds([-w + 10.0, -h + 10.0], [w - 10.0, h - 10.0]));

@@ -133,7 +133,9 @@ impl Paint {
         }
         if let Some(rust) = &self.rust {
             let ragged = rust.grain.at(x, y);
-            let level = 0.6 * rust.place.at(x, y) + 0.4 * cloud + 0.1 * (ragged - 0.5)
+            let level = 0.6 * rust.place.at(x, y)
+                + 0.4 * cloud
+                + 0.1 * (ragged - 0.5)
                 + 0.42 * (0.3 + 0.7 * rust.amount) * (-inset_mm / 2.2).exp();
             let edge = 1.0 - 0.2 * rust.amount;
             if level > edge - 0.06 {

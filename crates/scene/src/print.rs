@@ -35,11 +35,71 @@ const FONT: [[u8; 5]; 59] = [
 ];
 
 const WORDS: [&str; 40] = [
-    "OUTDOOR UNIT", "MODEL", "RATED", "VOLTAGE", "COOLING", "HEATING", "CAPACITY", "REFRIGERANT", "R410A", "R32", "R22",
-    "50HZ", "60HZ", "1 PH", "100V", "200V", "KG", "KW", "MASS", "SERIAL NO.", "CAUTION", "WARNING", "HIGH VOLTAGE",
-    "DO NOT REMOVE COVER", "IPX4", "MPA", "DESIGN PRESSURE", "MADE IN", "AIR CONDITIONER", "CURRENT", "INPUT", "W", "A",
-    "COMPRESSOR", "FAN MOTOR", "GROUND", "DISCONNECT POWER", "BEFORE SERVICING", "SEE MANUAL", "INVERTER",
+    "OUTDOOR UNIT",
+    "MODEL",
+    "RATED",
+    "VOLTAGE",
+    "COOLING",
+    "HEATING",
+    "CAPACITY",
+    "REFRIGERANT",
+    "R410A",
+    "R32",
+    "R22",
+    "50HZ",
+    "60HZ",
+    "1 PH",
+    "100V",
+    "200V",
+    "KG",
+    "KW",
+    "MASS",
+    "SERIAL NO.",
+    "CAUTION",
+    "WARNING",
+    "HIGH VOLTAGE",
+    "DO NOT REMOVE COVER",
+    "IPX4",
+    "MPA",
+    "DESIGN PRESSURE",
+    "MADE IN",
+    "AIR CONDITIONER",
+    "CURRENT",
+    "INPUT",
+    "W",
+    "A",
+    "COMPRESSOR",
+    "FAN MOTOR",
+    "GROUND",
+    "DISCONNECT POWER",
+    "BEFORE SERVICING",
+    "SEE MANUAL",
+    "INVERTER",
 ];
+
+/// A letter as strokes on a grid 4 wide and 6 high.
+#[rustfmt::skip]
+fn strokes(letter: u8) -> &'static [&'static [(f32, f32)]] {
+    match letter {
+        b'A' => &[&[(0., 6.), (2., 0.), (4., 6.)], &[(0.8, 4.), (3.2, 4.)]],
+        b'D' => &[&[(0., 0.), (0., 6.), (2.4, 6.), (4., 4.4), (4., 1.6), (2.4, 0.), (0., 0.)]],
+        b'E' => &[&[(4., 0.), (0., 0.), (0., 6.), (4., 6.)], &[(0., 3.), (3.2, 3.)]],
+        b'H' => &[&[(0., 0.), (0., 6.)], &[(4., 0.), (4., 6.)], &[(0., 3.), (4., 3.)]],
+        b'I' => &[&[(2., 0.), (2., 6.)]],
+        b'K' => &[&[(0., 0.), (0., 6.)], &[(4., 0.), (0., 3.6)], &[(1.3, 2.6), (4., 6.)]],
+        b'L' => &[&[(0., 0.), (0., 6.), (4., 6.)]],
+        b'M' => &[&[(0., 6.), (0., 0.), (2., 3.4), (4., 0.), (4., 6.)]],
+        b'N' => &[&[(0., 6.), (0., 0.), (4., 6.), (4., 0.)]],
+        b'P' => &[&[(0., 6.), (0., 0.), (3., 0.), (4., 1.), (4., 2.3), (3., 3.3), (0., 3.3)]],
+        b'R' => &[&[(0., 6.), (0., 0.), (3., 0.), (4., 1.), (4., 2.2), (3., 3.2), (0., 3.2)], &[(2., 3.2), (4., 6.)]],
+        b'S' => &[&[(4., 1.), (3., 0.), (1., 0.), (0., 1.), (0., 2.), (1., 3.), (3., 3.), (4., 4.), (4., 5.), (3., 6.), (1., 6.), (0., 5.)]],
+        b'T' => &[&[(0., 0.), (4., 0.)], &[(2., 0.), (2., 6.)]],
+        b'U' => &[&[(0., 0.), (0., 4.8), (1.2, 6.), (2.8, 6.), (4., 4.8), (4., 0.)]],
+        b'W' => &[&[(0., 0.), (1., 6.), (2., 2.6), (3., 6.), (4., 0.)]],
+        b'Z' => &[&[(0., 0.), (4., 0.), (0., 6.), (4., 6.)]],
+        _ => &[&[(1.2, 0.), (2.8, 0.), (4., 1.2), (4., 4.8), (2.8, 6.), (1.2, 6.), (0., 4.8), (0., 1.2), (1.2, 0.)]],
+    }
+}
 
 impl Print {
     fn blank(width_mm: f32, height_mm: f32, ground: [f32; 3], cover: f32, inks: &[[f32; 3]]) -> Self {
@@ -48,7 +108,9 @@ impl Print {
             width,
             height,
             dots: vec![0; width * height],
-            inks: std::iter::once((ground, cover)).chain(inks.iter().map(|&i| (i, 1.0))).collect(),
+            inks: std::iter::once((ground, cover))
+                .chain(inks.iter().map(|&i| (i, 1.0)))
+                .collect(),
         }
     }
 
@@ -108,7 +170,13 @@ impl Print {
             for (column, bits) in glyph.iter().enumerate() {
                 for row in 0..7 {
                     if bits >> row & 1 == 1 {
-                        self.fill(x + column as f32 * dot, y_mm + row as f32 * dot, dot + 0.08, dot + 0.08, ink);
+                        self.fill(
+                            x + column as f32 * dot,
+                            y_mm + row as f32 * dot,
+                            dot + 0.08,
+                            dot + 0.08,
+                            ink,
+                        );
                     }
                 }
             }
@@ -195,7 +263,13 @@ impl Print {
         let head = [[0.75, 0.38, 0.02], [0.55, 0.03, 0.03], [0.72, 0.6, 0.03]][rng.random_range(0..3)];
         let mut p = Self::blank(w, h, [0.82, 0.82, 0.8], 1.0, &[[0.03; 3], head]);
         p.fill(0.0, 0.0, w, 7.0, 2);
-        p.text(9.0, 1.6, 4.0, if rng.random_bool(0.5) { "WARNING" } else { "CAUTION" }, 1);
+        p.text(
+            9.0,
+            1.6,
+            4.0,
+            if rng.random_bool(0.5) { "WARNING" } else { "CAUTION" },
+            1,
+        );
         // triangle with a mark
         for k in 0..20 {
             let t = k as f32 / 20.0;
@@ -215,21 +289,61 @@ impl Print {
         p
     }
 
-    /// A brand's name printed straight on the sheet.
+    /// A brand's name printed straight on the sheet, in drawn letters.
     pub fn brand<R: RngExt + ?Sized>(rng: &mut R) -> Self {
-        let names = ["KAZE", "NORDAIR", "TOKIWA", "AEROLINE", "HOKUTO", "SUZUKAZE", "POLARIS", "MISTRAL"];
-        let size = rng.random_range(8.0..20.0f32);
+        let names = [
+            "KAZE", "NORDAIR", "TOKIWA", "AEROLINE", "HOKUTO", "SUZUKAZE", "POLARIS", "MISTRAL",
+        ];
+        let size = rng.random_range(7.0..20.0f32);
         let name = names[rng.random_range(0..names.len())];
         let color = [[0.04, 0.07, 0.25], [0.45, 0.03, 0.04], [0.12; 3], [0.35; 3]][rng.random_range(0..4)];
-        let mut p = Self::blank(size * 0.87 * name.len() as f32 + 2.0, size + 2.0, [0.5; 3], 0.0, &[color]);
-        p.text(1.0, 1.0, size, name, 1);
+        let unit = size / 6.0;
+        let wide = rng.random_range(0.75..1.3) * unit;
+        let half = rng.random_range(0.28..0.62) * unit;
+        let slant = if rng.random_bool(0.4) { 0.2 } else { 0.0 };
+        let step = 4.0 * wide + 1.5 * unit;
+        let length = step * name.len() as f32 + 2.0 * half + slant * size + 2.0;
+        let mut p = Self::blank(length, size + 2.0 * half + 2.0, [0.5; 3], 0.0, &[color]);
+        for (k, letter) in name.bytes().enumerate() {
+            for stroke in strokes(letter) {
+                for pair in stroke.windows(2) {
+                    let at = |(x, y): (f32, f32)| {
+                        (
+                            1.0 + half + k as f32 * step + wide * x + slant * (6.0 - y) * unit,
+                            1.0 + half + y * unit,
+                        )
+                    };
+                    p.line(at(pair[0]), at(pair[1]), half);
+                }
+            }
+        }
         p
+    }
+
+    /// A line of the first ink with round ends.
+    fn line(&mut self, a: (f32, f32), b: (f32, f32), half: f32) {
+        let dot = |v: f32, n: usize| ((v * DOTS).max(0.0) as usize).min(n);
+        let (ex, ey) = (b.0 - a.0, b.1 - a.1);
+        for y in dot(a.1.min(b.1) - half, self.height)..dot(a.1.max(b.1) + half + 1.0, self.height) {
+            for x in dot(a.0.min(b.0) - half, self.width)..dot(a.0.max(b.0) + half + 1.0, self.width) {
+                let (px, py) = (x as f32 / DOTS - a.0, y as f32 / DOTS - a.1);
+                let t = ((px * ex + py * ey) / (ex * ex + ey * ey).max(1e-6)).clamp(0.0, 1.0);
+                if (px - t * ex).hypot(py - t * ey) < half {
+                    self.dots[y * self.width + x] = 1;
+                }
+            }
+        }
     }
 
     /// A small sticker with a few characters or a sign.
     pub fn sticker<R: RngExt + ?Sized>(rng: &mut R) -> Self {
         let (w, h) = (rng.random_range(14.0..40.0f32), rng.random_range(10.0..24.0f32));
-        let ground = [[0.8, 0.8, 0.78], [0.75, 0.62, 0.05], [0.1, 0.3, 0.12], [0.5, 0.06, 0.05]][rng.random_range(0..4)];
+        let ground = [
+            [0.8, 0.8, 0.78],
+            [0.75, 0.62, 0.05],
+            [0.1, 0.3, 0.12],
+            [0.5, 0.06, 0.05],
+        ][rng.random_range(0..4)];
         let mut p = Self::blank(w, h, ground, 1.0, &[[0.03; 3]]);
         match rng.random_range(0..4) {
             0 => {

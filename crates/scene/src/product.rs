@@ -180,7 +180,9 @@ impl FaceDesign {
         let size = |b: &crate::shape::Bounds| (b.high[0] - b.low[0]) * (b.high[1] - b.low[1]);
         let layers = self.sheetwork.layers.iter();
         let largest = layers.max_by(|a, b| size(&a.bounds).total_cmp(&size(&b.bounds)));
-        largest.map_or(0.5, |l| 0.3 * l.paint.albedo[0] + 0.59 * l.paint.albedo[1] + 0.11 * l.paint.albedo[2])
+        largest.map_or(0.5, |l| {
+            0.3 * l.paint.albedo[0] + 0.59 * l.paint.albedo[1] + 0.11 * l.paint.albedo[2]
+        })
     }
 }
 

@@ -116,8 +116,7 @@ impl Near<'_> {
     #[inline]
     fn rise(&self, p: Xy) -> f32 {
         let slow = &self.slow;
-        let mut h =
-            slow.height + slow.slope[0] * (p[0] - slow.center[0]) + slow.slope[1] * (p[1] - slow.center[1]);
+        let mut h = slow.height + slow.slope[0] * (p[0] - slow.center[0]) + slow.slope[1] * (p[1] - slow.center[1]);
         for bump in &self.bumps {
             h += bump.height(p);
         }
@@ -162,8 +161,8 @@ struct Nearby<'a> {
 
 /// What keeps light from a block.
 struct Shade<'a> {
-    /// For every light: nothing of it arrives, or the sheets that may be in its way.
-    lights: Vec<(bool, Vec<Caster<'a>>)>,
+    /// For every light: the share that passes what blurs into a veil, and the sheets that may be in its way.
+    lights: Vec<(f32, Vec<Caster<'a>>)>,
     /// Sheets that hide part of the surroundings.
     open: Vec<Caster<'a>>,
     /// (tube, segment) for every light.
@@ -414,14 +413,19 @@ impl Prepared {
             (a[0] - b[0]).hypot(a[1] - b[1])
         };
         let even = |k: usize| {
-            let (dark, casters) = &shade.lights[k];
-            let softness = self.lighting.lights[k].at([corners[0].1[0], corners[0].1[1], heights.0]).softness;
+            let (share, casters) = &shade.lights[k];
+            let softness = self.lighting.lights[k]
+                .at([corners[0].1[0], corners[0].1[1], heights.0])
+                .softness;
             let wide = |above: f32| softness * above > 0.7 * across;
-            let sheets = casters
+            let sheets = casters.iter().all(|c| {
+                let above = c.layer.top_mm - heights.1;
+                c.index == near.index || wide(above - c.layer.wall_mm.min(0.5 * above))
+            });
+            let cords = shade.segments[k]
                 .iter()
-                .all(|c| c.index == near.index || wide(c.layer.top_mm - c.layer.wall_mm.min(0.5 * (c.layer.top_mm - heights.1)) - heights.1));
-            let cords = shade.segments[k].iter().all(|&(t, _)| wide(self.tubes[t].heights.0 - heights.1));
-            *dark || sheets && cords
+                .all(|&(t, _)| wide(self.tubes[t].heights.0 - heights.1));
+            *share <= 0.0 || sheets && cords
         };
         if !(0..shade.lights.len()).all(even) {
             return false;
@@ -540,7 +544,11 @@ impl Prepared {
                 bumps,
                 decals: decals.collect(),
                 inside,
-                edge_mm: if outside < -(half + layer.edge_mm) { 0.0 } else { layer.edge_mm },
+                edge_mm: if outside < -(half + layer.edge_mm) {
+                    0.0
+                } else {
+                    layer.edge_mm
+                },
                 slow,
             });
             // nothing below a closed sheet can be seen
@@ -615,7 +623,7 @@ impl Prepared {
             let rise = incoming.toward[2].max(0.05);
             let along = [incoming.toward[0] / rise, incoming.toward[1] / rise];
             let run = along[0].hypot(along[1]);
-            let mut dark = false;
+            let mut share = 1.0;
             let mut casters = Vec::new();
             for (index, layer) in higher.clone().enumerate() {
                 let above = (layer.top_mm - mid).max(0.0);
@@ -627,6 +635,15 @@ impl Prepared {
                 if !layer.bounds.meets(&region) {
                     continue;
                 }
+                // wires whose shadows are wider than the gaps between them
+                if let Some((gap, part)) = layer.shape.wires()
+                    && incoming.softness * (layer.top_mm - high) > 0.4 * gap
+                {
+                    if layer.bounds.grown(-width).meets(&region) {
+                        share *= 1.0 - part.min(0.7);
+                    }
+                    continue;
+                }
                 let reach = 0.5 * (above - foot) * run;
                 let between = [0.5 * (far[0] + near[0]), 0.5 * (far[1] + near[1])];
                 if layer.shape.distance(between) > width + reach {
@@ -635,16 +652,20 @@ impl Prepared {
                 let caster = caster(index, &region);
                 // wholly in the umbra; never for what may be the sheet itself
                 if layer.top_mm > high + 0.5 && !seen.contains(&index) && caster.solid_distance(far) < -width {
-                    dark = true;
+                    share = 0.0;
                     break;
                 }
                 casters.push(caster);
             }
             let mut cords = Vec::new();
-            if !dark {
+            if share > 0.0 {
                 for (t, tube) in self.tubes.iter().enumerate() {
                     let above = (tube.heights.1 - low).max(0.0);
-                    if !tube.bounds.grown(half + above * (run + incoming.softness) + 1.0).meets(&here) {
+                    if !tube
+                        .bounds
+                        .grown(half + above * (run + incoming.softness) + 1.0)
+                        .meets(&here)
+                    {
                         continue;
                     }
                     for (s, pair) in tube.points.windows(2).enumerate() {
@@ -662,7 +683,7 @@ impl Prepared {
                     }
                 }
             }
-            lights.push((dark, casters));
+            lights.push((share, casters));
             segments.push(cords);
         }
         let mut open = Vec::new();
@@ -951,12 +972,9 @@ impl Prepared {
 
     /// Share of a light that passes the sheets and tubes above a point.
     fn lit(&self, shade: &Shade, light: usize, hit: &Hit, point: [f32; 3], toward: [f32; 3], softness: f32) -> f32 {
-        let (dark, casters) = &shade.lights[light];
-        if *dark {
-            return 0.0;
-        }
-        if casters.is_empty() && shade.segments[light].is_empty() {
-            return 1.0;
+        let (share, casters) = &shade.lights[light];
+        if *share <= 0.0 || casters.is_empty() && shade.segments[light].is_empty() {
+            return *share;
         }
         let rise = toward[2].max(0.05);
         let along = [toward[0] / rise, toward[1] / rise];
@@ -991,12 +1009,12 @@ impl Prepared {
             let above = foot.height - point[2];
             let foot = segment_foot(a, b, [point[0] + above * along[0], point[1] + above * along[1]]);
             let width = softness * above + 0.25;
-            // A thin tube hides only its share of a wide light.
-            let share = (tube.radius / width).min(1.0);
+            // A thin tube hides only its part of a wide light.
+            let part = (tube.radius / width).min(1.0);
             let dark = (0.5 - 0.5 * (foot.distance - tube.radius) / width).clamp(0.0, 1.0);
-            lit = lit.min(1.0 - share * dark);
+            lit = lit.min(1.0 - part * dark);
         }
-        lit * lit * (3.0 - 2.0 * lit)
+        share * lit * lit * (3.0 - 2.0 * lit)
     }
 }
 

@@ -23,10 +23,8 @@ impl Bounds {
             high: [f32::MIN; 2],
         };
         for p in points {
-            for k in 0..2 {
-                b.low[k] = b.low[k].min(p[k]);
-                b.high[k] = b.high[k].max(p[k]);
-            }
+            b.low = [b.low[0].min(p[0]), b.low[1].min(p[1])];
+            b.high = [b.high[0].max(p[0]), b.high[1].max(p[1])];
         }
         b
     }
@@ -39,7 +37,10 @@ impl Bounds {
     /// Its middle, and how far its corners are from there.
     pub fn middle(&self) -> (Xy, f32) {
         let center = [0.5 * (self.low[0] + self.high[0]), 0.5 * (self.low[1] + self.high[1])];
-        (center, 0.5 * (self.high[0] - self.low[0]).hypot(self.high[1] - self.low[1]))
+        (
+            center,
+            0.5 * (self.high[0] - self.low[0]).hypot(self.high[1] - self.low[1]),
+        )
     }
     pub fn meets(&self, other: &Bounds) -> bool {
         (0..2).all(|k| self.low[k] <= other.high[k] && other.low[k] <= self.high[k])
@@ -204,6 +205,27 @@ impl Shape {
                 let wire = to_wire(dx, pitch[0]).min(to_wire(dy, pitch[1])) - half_width;
                 wire.max(rect_distance(dx, dy, half, 0.0))
             }
+        }
+    }
+
+    /// For wire work: widest gap between wires, mm, and the share of the area that the wires take.
+    pub fn wires(&self) -> Option<(f32, f32)> {
+        match *self {
+            Shape::Rings { pitch, half_width, .. } => Some((pitch, 2.0 * half_width / pitch)),
+            Shape::Mesh { pitch, half_width, .. } => Some((
+                pitch[0].max(pitch[1]),
+                2.0 * half_width / pitch[0] + 2.0 * half_width / pitch[1],
+            )),
+            Shape::Spokes {
+                count,
+                outer,
+                half_width,
+                ..
+            } if half_width < 6.0 => {
+                let gap = std::f32::consts::TAU * outer / count as f32;
+                Some((gap, 3.0 * half_width / gap))
+            }
+            _ => None,
         }
     }
 

@@ -83,7 +83,12 @@ impl FaceView {
         let design = unit.face(face)?.clone();
         let mut rng = Pcg64Mcg::seed_from_u64(seed);
         let camera = camera(rng.random());
-        let distance_mm = rng.random_range(1350.0..1650.0);
+        let distance_mm: f64 = rng.random_range(1350.0..1650.0);
+        // far enough for the whole face, turned and tilted
+        let across = |size: f64, other: f64, field_px: f64| (size + 0.07 * other) * 1.1 * camera.fx_px / field_px;
+        let distance_mm = distance_mm
+            .max(across(design.width_mm, design.height_mm, 4104.0))
+            .max(across(design.height_mm, design.width_mm, 3006.0));
         let yaw_rad: f64 = rng.random_range(-1.0..1.0f64) * 4f64.to_radians();
         let tilt_rad: f64 = rng.random_range(0.0..1.0f64).sqrt() * 6f64.to_radians();
         let toward: f64 = rng.random_range(0.0..std::f64::consts::TAU);
@@ -95,9 +100,7 @@ impl FaceView {
         // What is left of the field of view around the turned face.
         let room = |field_px: f64, size: f64, other: f64| {
             let reach = 0.5 * (size * yaw_rad.cos() + other * yaw_rad.abs().sin()) * 1.05;
-            (0.5 * field_px / camera.fx_px * distance_mm - reach)
-                .max(0.0)
-                .min(140.0)
+            (0.5 * field_px / camera.fx_px * distance_mm - reach).clamp(0.0, 140.0)
         };
         let (rx, ry) = (
             room(4104.0, design.width_mm, design.height_mm),
