@@ -3,7 +3,7 @@
 use crate::device::{ColorFrame, DepthFrame, DeviceError, Devices, Region, TagValue, tags};
 use crate::program::FaceId;
 use crate::record::FacePlane;
-use geometry::{Camera, CameraModel, DepthMap, Direction, Pixel, Point, RgbdFrame};
+use geometry::{Camera, CameraModel, DepthMap, Direction, Pixel, Point, RgbdFrame, SurfaceSample};
 use nalgebra::Vector3;
 
 /// Regions begin at multiples of this, so that depth of any usual step is aligned with colour, px.
@@ -257,6 +257,54 @@ impl FaceFit {
         })
     }
 
+    /// The plane that the screws of a face sit in. Where much of what shows lies behind the flanges (an open front, a grille),
+    /// the plane of most of the depth is not the face's: depth far from the screws is left out, and the sheet around
+    /// the heads has the last word.
+    ///
+    /// # Arguments
+    /// * `heads` – centres of the finds in the picture with the diameters of their heads, px.
+    pub fn around(frame: &RgbdFrame, heads: &[(Pixel, f64)], working_depth_mm: [f64; 2]) -> Option<Self> {
+        let camera = frame.camera?;
+        let sheet: Vec<(Point<Camera>, Direction<Camera>)> = heads
+            .iter()
+            .filter_map(|(pixel, diameter_px)| {
+                let plane = sheet_plane(frame, *pixel, *diameter_px)?;
+                Some((
+                    camera.unproject(*pixel, plane.depth_mm),
+                    plane_normal(&camera, *pixel, &plane)?,
+                ))
+            })
+            .collect();
+        if sheet.len() < 3 {
+            return Self::of(frame, working_depth_mm);
+        }
+        let middle_mm = median(sheet.iter().map(|s| s.0.z_mm()));
+        let [near, far] = working_depth_mm;
+        let limits = [
+            near.max(middle_mm - FACE_RELIEF_MM),
+            far.min(middle_mm + FACE_RELIEF_MM),
+        ];
+        let axis = |a: usize| median(sheet.iter().map(|s| s.1.vector()[a]));
+        let normal = Direction::from_vector(Vector3::new(axis(0), axis(1), axis(2)))?;
+        let whole = Self::of(frame, limits).filter(|fit| {
+            let agrees = |n: Direction<Camera>| n.angle_rad(normal) <= SHEETS_AGREE_RAD;
+            fit.normal().is_some_and(agrees)
+        });
+        whole.or_else(|| {
+            let n = normal.vector();
+            let distance_mm = median(sheet.iter().map(|s| s.0.vector().dot(&n)));
+            let per_distance = 1e6 / distance_mm;
+            Some(Self {
+                inverse: [
+                    n.z * per_distance,
+                    n.x * per_distance / camera.fx_px,
+                    n.y * per_distance / camera.fy_px,
+                ],
+                camera,
+            })
+        })
+    }
+
     /// Normal of the face, towards the camera.
     pub fn normal(&self) -> Option<Direction<Camera>> {
         let [w, wu, wv] = self.inverse;
@@ -283,28 +331,48 @@ pub fn tilt_rad(normal: Direction<Camera>) -> f64 {
     normal.vector().angle(&-Vector3::z())
 }
 
+/// How far a face reaches before and behind the middle of its screws at the tilt that is allowed, mm.
+const FACE_RELIEF_MM: f64 = 70.0;
+/// The plane of most of the depth is the face's if the sheet around the heads leans no further from it, rad.
+const SHEETS_AGREE_RAD: f64 = 0.035;
+
+fn median(values: impl Iterator<Item = f64>) -> f64 {
+    let mut values: Vec<f64> = values.collect();
+    values.sort_by(f64::total_cmp);
+    let (low, high) = (values.len().saturating_sub(1) / 2, values.len() / 2);
+    match (values.get(low), values.get(high)) {
+        (Some(a), Some(b)) => 0.5 * (a + b),
+        _ => 0.0,
+    }
+}
+
 /// Normal of the sheet around a head, towards the camera; `None` without enough depth there.
 pub fn sheet_normal(frame: &RgbdFrame, pixel: Pixel, diameter_px: f64) -> Option<Direction<Camera>> {
-    let (depth, camera) = (frame.depth.as_ref()?, frame.camera?);
-    let plane = depth.plane_at(pixel, 0.8 * diameter_px, 2.0 * diameter_px)?;
-    if plane.inliers < 40 {
-        return None;
-    }
+    plane_normal(&frame.camera?, pixel, &sheet_plane(frame, pixel, diameter_px)?)
+}
+
+/// Depth of the sheet around a head, at its centre, mm; `None` without enough depth there.
+pub fn sheet_depth_mm(frame: &RgbdFrame, pixel: Pixel, diameter_px: f64) -> Option<f64> {
+    sheet_plane(frame, pixel, diameter_px).map(|plane| plane.depth_mm)
+}
+
+fn sheet_plane(frame: &RgbdFrame, pixel: Pixel, diameter_px: f64) -> Option<SurfaceSample> {
+    let plane = frame
+        .depth
+        .as_ref()?
+        .plane_at(pixel, 0.8 * diameter_px, 2.0 * diameter_px)?;
+    (plane.inliers >= 40).then_some(plane)
+}
+
+fn plane_normal(camera: &CameraModel, pixel: Pixel, plane: &SurfaceSample) -> Option<Direction<Camera>> {
     let at = |du: f64, dv: f64| {
         let z = plane.depth_mm + plane.slope_mm_per_px[0] * du + plane.slope_mm_per_px[1] * dv;
-        camera
-            .unproject(Pixel::new(pixel.u_px + du, pixel.v_px + dv), z)
-            .vector()
+        let pixel = Pixel::new(pixel.u_px + du, pixel.v_px + dv);
+        camera.unproject(pixel, z).vector()
     };
     let middle = at(0.0, 0.0);
     let normal = (at(4.0, 0.0) - middle).cross(&(at(0.0, 4.0) - middle));
     Direction::from_vector(if normal.z > 0.0 { -normal } else { normal })
-}
-
-/// Where the depth at a pixel puts it in the camera's frame, from the measurements within a radius.
-pub fn point_at(frame: &RgbdFrame, pixel: Pixel, radius_px: f64) -> Option<Point<Camera>> {
-    let (depth, camera) = (frame.depth.as_ref()?, frame.camera?);
-    depth.point_at(&camera, pixel, 0.0, radius_px).map(|(point, _)| point)
 }
 
 #[cfg(test)]
@@ -361,6 +429,39 @@ mod tests {
         let z = 1500.0 * n.z / (n.x * x + n.y * y + n.z);
         assert!((fit.depth_mm(pixel) - z).abs() < 1.0);
         assert!(FaceFit::of(&frame, [300.0, 400.0]).is_none());
+    }
+
+    #[test]
+    fn an_open_front_does_not_hide_the_plane_of_its_flanges() {
+        let tilt = 4f64.to_radians();
+        let mut frame = tilted_face(Vector3::new(tilt.sin(), 0.0, -tilt.cos()));
+        let heads: Vec<(Pixel, f64)> = [
+            (160.0, 100.0),
+            (400.0, 98.0),
+            (640.0, 100.0),
+            (150.0, 300.0),
+            (160.0, 500.0),
+        ]
+        .map(|(u, v)| (Pixel::new(u, v), 20.0))
+        .to_vec();
+        // all but a frame of flanges lies up to 280 mm further back, and leans
+        if let Some(depth) = &mut frame.depth {
+            for j in 75..240 {
+                for i in 105..320 {
+                    depth.depth_mm[(j * depth.width + i) as usize] += 40.0 + 1.1 * (i - 105) as f32;
+                }
+            }
+        }
+        let most = FaceFit::of(&frame, [1100.0, 1750.0])
+            .and_then(|f| f.normal())
+            .expect("a plane");
+        assert!((tilt_rad(most) - tilt).abs() > 0.1, "the scene should mislead");
+        let fit = FaceFit::around(&frame, &heads, [1100.0, 1750.0]).expect("a plane");
+        let plane = fit.plane().expect("a plane");
+        assert!(
+            (plane.tilt_rad - tilt).abs() < 5e-3 && (plane.depth_mm - 1500.0).abs() < 1.0,
+            "{plane:?}"
+        );
     }
 
     #[test]

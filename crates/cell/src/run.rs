@@ -3,7 +3,7 @@
 //! Every act is in the journal before it is begun, every answer before the next act. The state of a unit is the fold of its events
 //! ([`UnitRecord`]), so that going on after a crash and going on after a step are the same thing.
 
-use crate::capture::{FaceFit, Shot, present, region_around, regions_around, shoot};
+use crate::capture::{FaceFit, Shot, present, region_around, regions_around, sheet_depth_mm, shoot};
 use crate::config::CellConfig;
 use crate::device::{DeviceError, Devices, DriveEnd, DriveProgram, TagValue, jobs, tags};
 use crate::journal::{Journal, JournalError};
@@ -18,7 +18,7 @@ use calibration::Map;
 use geometry::{Pixel, RgbdFrame};
 use std::sync::Arc;
 
-/// A cover is off if its face lies this much deeper than before, mm.
+/// A cover is off if the sheet around its screws lies this much deeper than before, mm.
 const COVER_OFF_MM: f64 = 15.0;
 
 /// Finds screws in a shot. [`vision::Detector`] does; tests have their own.
@@ -408,24 +408,25 @@ impl Way<'_> {
         Ok(())
     }
 
-    /// Whether the face that stands before the camera is still where it was when it was last looked at.
+    /// Whether the face that stands before the camera is still there: the sheet around the places where its screws were.
     async fn is_cover_off(&mut self, face: &FaceId) -> Result<PullEnd, Stop> {
         let config = self.runner.config.inspection;
-        let before = self
-            .record
-            .faces
-            .iter()
-            .rev()
-            .find(|f| f.face == *face)
-            .and_then(|f| f.plane);
         let shot = shoot(&self.runner.devices, None, config.depth_frames.max(1)).await?;
-        let now = FaceFit::of(&shot.frame, config.working_depth_mm).and_then(|fit| fit.plane());
-        Ok(match (before, now) {
-            (Some(before), Some(now)) if (now.depth_mm - before.depth_mm).abs() < COVER_OFF_MM => PullEnd::Stuck,
-            (Some(_), _) => PullEnd::Off,
-            // never measured before: pulling once more is bounded, leaving it on is not what was asked for
-            (None, _) => PullEnd::Stuck,
-        })
+        let before = self.record.faces.iter().rev().find(|f| f.face == *face);
+        let places = before
+            .into_iter()
+            .flat_map(|f| &f.found)
+            .filter_map(|f| Some((f, f.camera_mm?.z_mm())));
+        let (mut there, mut gone) = (0, 0);
+        for (found, depth_mm) in places {
+            let pixel = Pixel::new(found.u_px, found.v_px);
+            match sheet_depth_mm(&shot.frame, pixel, found.diameter_px) {
+                Some(now_mm) if (now_mm - depth_mm).abs() < COVER_OFF_MM => there += 1,
+                _ => gone += 1,
+            }
+        }
+        // never measured before: pulling once more is bounded, leaving it on is not what was asked for
+        Ok(if gone > there { PullEnd::Off } else { PullEnd::Stuck })
     }
 
     /// Sends the arms out of the way of table and camera.
@@ -460,7 +461,8 @@ impl Way<'_> {
         let shot = shoot(&self.runner.devices, None, config.inspection.depth_frames).await?;
         let screws = self.runner.finder.find(&shot.frame);
         self.budget(&shot);
-        let fit = FaceFit::of(&shot.frame, config.inspection.working_depth_mm);
+        let heads: Vec<(Pixel, f64)> = screws.iter().map(|s| (s.pixel, s.diameter_px)).collect();
+        let fit = FaceFit::around(&shot.frame, &heads, config.inspection.working_depth_mm);
         let (found, targets) = plan::plan(&screws, &shot, fit.as_ref(), &self.reaches(), &config);
         let picture = self
             .runner
