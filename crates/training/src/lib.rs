@@ -12,9 +12,9 @@ mod train;
 mod tune;
 
 pub use evaluate::{
-    CropEvaluation, EvaluateError, Evaluation, Evaluator, FIRST_EVALUATION_SEED, Mistake, NegativeTally, PhotoEvaluation,
-    Product, ScrewTally, Share, Spread, evaluate_crops, evaluate_faces, evaluate_truth_folder, evaluate_yolo_folder,
-    truth_files, wilson,
+    Coverage, CropEvaluation, DecoyRow, DriveRow, EvaluateError, Evaluation, Evaluator, FIRST_EVALUATION_SEED,
+    FalseFind, Miss, PhotoEvaluation, Product, Quantiles, Rate, SceneRow, StageOne, evaluate_crops, evaluate_faces,
+    evaluate_truth_folder, evaluate_yolo_folder, truth_files, wilson,
 };
 pub use train::{Progress, TRAINING_SEEDS, TUNING_SEEDS, TrainError, TrainReport, TrainSettings, train};
 pub use tune::Tuning;
