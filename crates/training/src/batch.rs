@@ -141,7 +141,7 @@ fn fill(stage: Stage, patch: &Patch, rng: &mut Pcg64Mcg, pixels: &mut [f32], tar
             Some((r, at, d, label)) if r < LABEL_RADIUS => Target {
                 classes: label.classes,
                 weight: 1.0,
-                regression: label.exact.then(|| {
+                regression: (stage == Stage::Fine && label.exact && label.classes != 0).then(|| {
                     [
                         ((at[0] - x) / OFFSET_UNIT_PX) as f32,
                         ((at[1] - y) / OFFSET_UNIT_PX) as f32,
@@ -170,7 +170,6 @@ fn coarse(target: &mut Target) {
     } else {
         *target = Target::default();
     }
-    target.regression = None;
 }
 
 fn sample(rgb: &[u8], u: f64, v: f64, out: &mut [f32]) {

@@ -2,16 +2,15 @@
 
 use crate::{Ended, output};
 use anyhow::{Context, Result, bail};
-use calibration::{Hull, Map, MappedPoint};
+use calibration::Map;
 use geometry::{RgbdFrame, read_camera_info, read_rgbd};
-use serde::Serialize;
 use std::{
     io::Write,
     ops::RangeInclusive,
     path::{Path, PathBuf},
     time::Instant,
 };
-use vision::{Detections, Detector, Options, Screw, Timing, Verdict};
+use vision::{Detections, Detector, Hull, Mapped, Options, Screw, Verdict};
 
 /// Finds the screws in photographs: where, how sure, which drive, and in millimetres where depth, camera and map are given.
 #[derive(clap::Args)]
@@ -59,61 +58,20 @@ pub(crate) fn head_range(text: &str) -> Result<RangeInclusive<f64>, String> {
     Ok(low..=high)
 }
 
-/// A line of `detect --json`, see the contract in the README: fields are added, never renamed or dropped.
-#[derive(Serialize)]
-struct Line<'a> {
-    image: &'a str,
-    width_px: u32,
-    height_px: u32,
-    model: &'a str,
-    screws: Vec<ScrewLine>,
-    timing_ms: Timing,
-}
-
-#[derive(Serialize)]
-struct ScrewLine {
-    u_px: f64,
-    v_px: f64,
-    sigma_px: f64,
-    diameter_px: f64,
-    score: f64,
-    drive: &'static str,
-    verdict: Verdict,
-    camera_mm: Option<[f64; 3]>,
-    base_mm: Option<[f64; 3]>,
-    sigma_lateral_mm: Option<f64>,
-    sigma_depth_mm: Option<f64>,
-    hull: Option<Hull>,
-    cues: Vec<String>,
-}
-
-fn rounded(value: f64, digits: i32) -> f64 {
-    let unit = 10f64.powi(digits);
-    (value * unit).round() / unit
-}
-
-fn screw_line(screw: &Screw, mapped: Option<MappedPoint>) -> ScrewLine {
-    let point = |p: [f64; 3]| p.map(|v| rounded(v, 3));
-    ScrewLine {
-        u_px: rounded(screw.pixel.u_px, 3),
-        v_px: rounded(screw.pixel.v_px, 3),
-        sigma_px: rounded(screw.sigma_px, 3),
-        diameter_px: rounded(screw.diameter_px, 2),
-        score: rounded(screw.score, 5),
-        drive: screw.drive.name(),
-        verdict: screw.verdict,
-        camera_mm: screw.camera.map(|p| point(p.to_array())),
-        base_mm: mapped.map(|m| point(m.base.to_array())),
-        // with a map: of the base point, measurement and map together; without: of the camera point
-        sigma_lateral_mm: combined(screw.sigma_lateral_mm, mapped.map(|m| m.sigma_lateral_mm)),
-        sigma_depth_mm: combined(screw.sigma_depth_mm, mapped.map(|m| m.sigma_depth_mm)),
-        hull: mapped.map(|m| m.hull),
-        cues: screw.cues.iter().map(|c| format!("{c:?}").to_lowercase()).collect(),
-    }
-}
-
-fn combined(measured: Option<f64>, map: Option<f64>) -> Option<f64> {
-    measured.map(|m| rounded(m.hypot(map.unwrap_or(0.0)), 3))
+/// What the map adds to a find: sigmas are those of map and measurement together.
+fn mapped(screw: &Screw, map: Option<&Map>) -> Option<Mapped> {
+    let point = map?.apply(screw.camera?);
+    let both = |measured: Option<f64>, map: f64| measured.unwrap_or(0.0).hypot(map);
+    Some(Mapped {
+        base: point.base,
+        sigma_lateral_mm: both(screw.sigma_lateral_mm, point.sigma_lateral_mm),
+        sigma_depth_mm: both(screw.sigma_depth_mm, point.sigma_depth_mm),
+        hull: match point.hull {
+            calibration::Hull::Inside => Hull::Inside,
+            calibration::Hull::Edge => Hull::Edge,
+            calibration::Hull::Outside => Hull::Outside,
+        },
+    })
 }
 
 pub fn run(args: &Args) -> Result<Ended> {
@@ -174,33 +132,23 @@ fn one(
     let frame: RgbdFrame = read_rgbd(image, depth, args.camera.as_deref())?;
     let decode_ms = begin.elapsed().as_secs_f64() * 1e3;
     let mut found: Detections = detector.detect(&frame, options);
-    found.timing_ms.decode = rounded(decode_ms, 2);
+    found.timing_ms.decode = decode_ms;
     found.timing_ms.total += decode_ms;
     let name = image.display().to_string();
-    let mapped: Vec<Option<MappedPoint>> =
-        found.screws.iter().map(|s| s.camera.zip(map).map(|(point, map)| map.apply(point))).collect();
     if args.json {
-        let line = Line {
-            image: &name,
-            width_px: found.size_px.0,
-            height_px: found.size_px.1,
-            model: &found.model,
-            screws: found.screws.iter().zip(&mapped).map(|(s, m)| screw_line(s, *m)).collect(),
-            timing_ms: found.timing_ms,
-        };
-        writeln!(out, "{}", serde_json::to_string(&line)?)?;
+        writeln!(out, "{}", serde_json::to_string(&found.report(&name, |screw| mapped(screw, map)))?)?;
     } else {
-        table(out, &name, &found, &mapped)?;
+        table(out, &name, &found, map)?;
     }
     if let Some(folder) = &args.overlay {
         let stem = image.file_stem().with_context(|| format!("{name} has no file name"))?;
         let path = folder.join(format!("{}.jpg", stem.to_string_lossy()));
-        geometry::write_jpeg(&path, &vision::overlay(&frame.color, &found.screws), 92)?;
+        geometry::write_jpeg(&path, &vision::overlay(&frame.color, &found), 92)?;
     }
     Ok(())
 }
 
-fn table(out: &mut impl Write, name: &str, found: &Detections, mapped: &[Option<MappedPoint>]) -> Result<()> {
+fn table(out: &mut impl Write, name: &str, found: &Detections, map: Option<&Map>) -> Result<()> {
     let count = |v| found.screws.iter().filter(|s| s.verdict == v).count();
     writeln!(
         out,
@@ -216,8 +164,8 @@ fn table(out: &mut impl Write, name: &str, found: &Detections, mapped: &[Option<
         return Ok(());
     }
     writeln!(out, "  verdict  drive       score      u px      v px   ± px  head px  base x, y, z mm (or camera)")?;
-    for (screw, mapped) in found.screws.iter().zip(mapped) {
-        let place = match (mapped, screw.camera) {
+    for screw in &found.screws {
+        let place = match (mapped(screw, map), screw.camera) {
             (Some(m), _) => {
                 let [x, y, z] = m.base.to_array();
                 format!("{x:9.2} {y:9.2} {z:9.2}  {:?}", m.hull).to_lowercase()

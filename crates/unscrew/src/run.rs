@@ -10,7 +10,7 @@ use calibration::{Identity, Map, Settings, Volume, camera_identity, lattice, rea
 use cell::{
     CaptureSettings, CellConfig, Journal, Observer, Outcome, Program, Runner, Statistics, UnitRecord, capture_pairs as capture,
     config::Backend,
-    device::{Clock, Devices},
+    device::Devices,
     record::{FaceRecord, PullEnd, Verdict},
 };
 use geometry::{Base, Direction};
