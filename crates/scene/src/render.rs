@@ -386,8 +386,8 @@ impl Prepared {
         out
     }
 
-    /// Renders a block that shows nothing but the middle of one flat sheet, evenly lit: light changes slowly there, so it
-    /// is worked out at the corners only. False, and nothing done, if the block is not like that.
+    /// Renders a block that shows nothing but the middle of one flat sheet: light changes slowly there, so it is worked out
+    /// at a few nodes only. False, and nothing done, if the block is not like that.
     fn plain(&self, rays: &Rays, nearby: &Nearby, out: &mut Block) -> bool {
         let [near] = nearby.layers.as_slice() else { return false };
         let simple = near.inside && near.cutouts.is_empty() && near.is_flat();
@@ -407,7 +407,7 @@ impl Prepared {
             heights = (heights.0.min(*h), heights.1.max(*h));
         }
         let shade = self.shade(rays, heights, &[near.index], false);
-        // Shadows may cross the block if their borders are wider than it.
+        // Shadows may cross the block if their borders are wider than the distance between nodes.
         let across = {
             let (a, b) = (corners[0].1, corners[3].1);
             (a[0] - b[0]).hypot(a[1] - b[1])
@@ -427,14 +427,21 @@ impl Prepared {
                 .all(|&(t, _)| wide(self.tubes[t].heights.0 - heights.1));
             *share <= 0.0 || sheets && cords
         };
-        if !(0..shade.lights.len()).all(even) {
+        let nodes = if (0..shade.lights.len()).all(even) {
+            2
+        } else if layer.top_mm < BEHIND_MM {
+            6 // out of focus behind the face
+        } else {
             return false;
-        }
-        let count = self.lighting.lights.len().min(8);
+        };
         let normal = unit([-near.slow.slope[0], -near.slow.slope[1], 1.0]);
         let metal = layer.paint.metallic() > 0.0 || !near.decals.is_empty();
-        // light given off at each corner by black and grey, matt and metal: linear in both between
-        let lights = corners.map(|(ray, p, height, _)| {
+        // light given off at each node by black and grey, matt and metal: linear in both between
+        let step = last / (nodes - 1) as f32;
+        let count = self.lighting.lights.len().min(8);
+        let mut lights = [[[0.0f32; 3]; 4]; 36];
+        for (node, light) in lights.iter_mut().take(nodes * nodes).enumerate() {
+            let (ray, p, height, _) = place((node % nodes) as f32 * step, (node / nodes) as f32 * step);
             let view = unit([ray.slope[0], ray.slope[1], 1.0]);
             let hit = Hit {
                 height,
@@ -449,7 +456,7 @@ impl Prepared {
                 let incoming = light.at(point);
                 *seen = self.lit(&shade, k, &hit, point, incoming.toward, incoming.softness);
             }
-            [(0.0, 0.0), (0.5, 0.0), (0.0, 1.0), (0.5, 1.0)].map(|(albedo, metallic)| {
+            *light = [(0.0, 0.0), (0.5, 0.0), (0.0, 1.0), (0.5, 1.0)].map(|(albedo, metallic)| {
                 if metallic > 0.0 && !metal {
                     return [0.0; 3];
                 }
@@ -460,15 +467,22 @@ impl Prepared {
                 };
                 self.lighting
                     .radiance(&material, normal, view, &visible[..count], open, point)
-            })
-        });
+            });
+        }
         for y in 0..BLOCK {
-            let fy = y as f32 / last;
-            let at = |side: usize, m: usize, k: usize| lerp(lights[side][m][k], lights[side + 2][m][k], fy);
-            let left: [[f32; 3]; 4] = std::array::from_fn(|m| std::array::from_fn(|k| at(0, m, k)));
-            let right: [[f32; 3]; 4] = std::array::from_fn(|m| std::array::from_fn(|k| at(1, m, k)));
+            let gy = y as f32 / step;
+            let row = (gy as usize).min(nodes - 2);
+            let fy = gy - row as f32;
+            let mut columns = [[[0.0f32; 3]; 4]; 6];
+            for (c, column) in columns.iter_mut().take(nodes).enumerate() {
+                let (above, below) = (&lights[row * nodes + c], &lights[(row + 1) * nodes + c]);
+                *column = std::array::from_fn(|m| std::array::from_fn(|k| lerp(above[m][k], below[m][k], fy)));
+            }
             for x in 0..BLOCK {
-                let fx = x as f32 / last;
+                let gx = x as f32 / step;
+                let column = (gx as usize).min(nodes - 2);
+                let fx = gx - column as f32;
+                let (left, right) = (&columns[column], &columns[column + 1]);
                 let (_, p, _, depth) = place(x as f32, y as f32);
                 let mut material = layer.paint.at(p, 20.0);
                 for decal in &near.decals {
@@ -1017,6 +1031,9 @@ impl Prepared {
         share * lit * lit * (3.0 - 2.0 * lit)
     }
 }
+
+/// What lies lower than this is behind the face: no item sits there.
+const BEHIND_MM: f32 = -100.0;
 
 /// Below this nothing is drawn, mm.
 const FLOOR_MM: f32 = -2500.0;
