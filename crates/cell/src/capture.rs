@@ -311,6 +311,16 @@ impl FaceFit {
         Direction::from_vector(-Vector3::new(wu * self.camera.fx_px, wv * self.camera.fy_px, w))
     }
 
+    /// How far heads lean from the face together: one that is seated askew does not move the median. `None` with fewer than three.
+    pub fn lean_rad(&self, heads: impl Iterator<Item = Direction<Camera>>) -> Option<f64> {
+        let heads: Vec<_> = heads.collect();
+        if heads.len() < 3 {
+            return None;
+        }
+        let axis = |a: usize| median(heads.iter().map(|n| n.vector()[a]));
+        Some(Direction::from_vector(Vector3::new(axis(0), axis(1), axis(2)))?.angle_rad(self.normal()?))
+    }
+
     /// Depth of the plane at a pixel, mm.
     pub fn depth_mm(&self, pixel: Pixel) -> f64 {
         let [w, wu, wv] = self.inverse;
@@ -322,6 +332,7 @@ impl FaceFit {
         Some(FacePlane {
             depth_mm: 1e6 / self.inverse[0],
             tilt_rad: tilt_rad(self.normal()?),
+            heads_lean_rad: None,
         })
     }
 }

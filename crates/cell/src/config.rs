@@ -119,6 +119,8 @@ pub struct Exclusion {
     pub review_score_min: f64,
     /// Largest tilt of a face against the camera's axis, rad: ±6° by specification, and 2° for the measurement.
     pub face_tilt_max_rad: f64,
+    /// Largest lean of a face's screws together against the face, rad: beyond, the bit slips out of them.
+    pub heads_lean_max_rad: f64,
     /// Largest tilt of the sheet around a screw against the camera's axis, rad.
     pub screw_tilt_max_rad: f64,
     /// Screws of a face that may sit on sheet bent beyond that before it is excluded.
@@ -131,6 +133,7 @@ impl Default for Exclusion {
             review_max: 0,
             review_score_min: 0.3,
             face_tilt_max_rad: 8f64.to_radians(),
+            heads_lean_max_rad: 7f64.to_radians(),
             screw_tilt_max_rad: 11f64.to_radians(),
             bent_max: 0,
         }

@@ -313,6 +313,14 @@ pub fn exclusion(face: &FaceRecord, least_screws: usize, config: &CellConfig) ->
             format!("{name}: the face leans by {tilt:.1}°, more than {most:.1}°"),
         ));
     }
+    let leaning = face.plane.and_then(|plane| plane.heads_lean_rad);
+    if let Some(lean) = leaning.filter(|lean| *lean > rules.heads_lean_max_rad) {
+        let (lean, most) = (lean.to_degrees(), rules.heads_lean_max_rad.to_degrees());
+        return Some((
+            ExclusionReason::CoverBent,
+            format!("{name}: its screws lean together by {lean:.1}°, more than {most:.1}°"),
+        ));
+    }
     let count = |reason: LeftAlone| face.found.iter().filter(|f| f.left_alone == Some(reason)).count();
     let bent = count(LeftAlone::Bent);
     if bent > rules.bent_max {

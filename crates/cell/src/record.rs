@@ -91,6 +91,9 @@ pub struct FacePlane {
     pub depth_mm: f64,
     /// Tilt against the camera's axis, rad.
     pub tilt_rad: f64,
+    /// How far the heads of its screws lean from it together, rad; `None` with fewer than three.
+    #[serde(default)]
+    pub heads_lean_rad: Option<f64>,
 }
 
 /// One burst of the driver.

@@ -10,8 +10,8 @@ use crate::journal::{Journal, JournalError};
 use crate::plan::{self, Reach, SafeTarget, Target};
 use crate::program::{FaceId, Program, Step, Work};
 use crate::record::{
-    Act, CoverRecord, Event, ExclusionReason, FaceRecord, LeftAlone, NgReason, Outcome, PictureId, PullEnd, Purpose,
-    ScrewAttempt, SeenBy, UnitRecord, Verdict,
+    Act, CoverRecord, Event, ExclusionReason, FacePlane, FaceRecord, LeftAlone, NgReason, Outcome, PictureId, PullEnd,
+    Purpose, ScrewAttempt, SeenBy, UnitRecord, Verdict,
 };
 use crate::removal::{Mover, Retry, retry_after};
 use calibration::Map;
@@ -468,6 +468,17 @@ impl Way<'_> {
             .runner
             .journal
             .store_picture(&shot.frame.color, config.journal.jpeg_quality)?;
+        let heads = screws
+            .iter()
+            .filter(|s| s.verdict == Verdict::Screw)
+            .filter_map(|s| s.normal);
+        let plane = fit.as_ref().and_then(|fit| {
+            let heads_lean_rad = fit.lean_rad(heads);
+            fit.plane().map(|plane| FacePlane {
+                heads_lean_rad,
+                ..plane
+            })
+        });
         let seen = FaceRecord {
             step: index,
             step_name: step.name.clone(),
@@ -477,7 +488,7 @@ impl Way<'_> {
             picture: Some(picture),
             width_px: shot.frame.color.width(),
             height_px: shot.frame.color.height(),
-            plane: fit.and_then(|fit| fit.plane()),
+            plane,
             found,
             attempts: Vec::new(),
         };

@@ -159,6 +159,29 @@ fn a_bent_face_excludes_and_a_survey_sees_it_before_the_first_screw() {
 }
 
 #[test]
+fn screws_that_lean_together_exclude_a_single_one_does_not() {
+    let face = || vec![screw(-100.0, 0.0), screw(0.0, 50.0), screw(100.0, 0.0)];
+    for (count, excluded) in [(3, true), (2, false)] {
+        let fake = Fake::new(&[("front", face()[..count].to_vec())]);
+        fake.world().lean_rad.insert("front".into(), 9f64.to_radians());
+        let record = run(&fake);
+        let bent = matches!(
+            record.outcome,
+            Some(Outcome::Excluded {
+                reason: ExclusionReason::CoverBent,
+                ..
+            })
+        );
+        assert_eq!(
+            (bent, fake.calls("drive") == 0),
+            (excluded, excluded),
+            "{:?}",
+            record.outcome
+        );
+    }
+}
+
+#[test]
 fn nothing_outside_the_calibrated_volume_is_ever_commanded() {
     // 340 mm to the side: the volume ends at 300; 299.9: inside, but no way of approach that stays inside
     let fake = Fake::new(&[

@@ -49,6 +49,8 @@ pub struct World {
     pub faces: BTreeMap<String, Vec<Head>>,
     /// Tilt of a face about the camera's y, rad.
     pub tilt_rad: BTreeMap<String, f64>,
+    /// Lean of the heads of a face against it, rad.
+    pub lean_rad: BTreeMap<String, f64>,
     /// Covers that are off.
     pub off: Vec<String>,
     /// What was asked, in order.
@@ -86,6 +88,7 @@ impl Fake {
                 holding: false,
                 faces: all,
                 tilt_rad: BTreeMap::new(),
+                lean_rad: BTreeMap::new(),
                 off: Vec::new(),
                 log: Vec::new(),
                 poses: Vec::new(),
@@ -298,6 +301,7 @@ impl Finder for Fake {
     fn find(&self, frame: &RgbdFrame) -> Vec<vision::Screw> {
         let world = self.world();
         let tilt = world.tilt_rad.get(&world.presented).copied().unwrap_or(0.0);
+        let lean = world.lean_rad.get(&world.presented).copied().unwrap_or(0.0);
         let Some(part) = frame.camera else { return Vec::new() };
         let heads = world.faces.get(&world.presented).cloned().unwrap_or_default();
         heads
@@ -316,7 +320,7 @@ impl Finder for Fake {
                     cues: Vec::new(),
                     angle_rad: None,
                     camera: frame.depth.as_ref().map(|_| point),
-                    normal: Direction::from_vector(normal(tilt)),
+                    normal: Direction::from_vector(normal(tilt + lean)),
                     sigma_lateral_mm: Some(0.1),
                     sigma_depth_mm: Some(0.1),
                 })
