@@ -195,13 +195,18 @@ fn relight(rgb: &mut [f32], side: usize, rng: &mut Pcg64Mcg) {
     let slope = [rng.random_range(-0.25..0.25f32), rng.random_range(-0.25..0.25f32)];
     let noise = if rng.random_bool(0.5) { rng.random_range(0.0..7.0f32) } else { 0.0 };
     let s = side as f32;
+    let tone: [f32; 257] = std::array::from_fn(|v| 255.0 * (v as f32 / 255.0).powf(gamma));
+    let curve = |v: f32| {
+        let v = v.clamp(0.0, 255.0);
+        let (i, f) = (v as usize, v.fract());
+        tone[i] + f * (tone[i + 1] - tone[i])
+    };
     for (k, pixel) in rgb.chunks_exact_mut(3).enumerate() {
         let (x, y) = ((k % side) as f32 / s - 0.5, (k / side) as f32 / s - 0.5);
         let shade = gain * (1.0 + slope[0] * x + slope[1] * y);
         let luma = 0.3 * pixel[0] + 0.59 * pixel[1] + 0.11 * pixel[2];
         for (c, value) in pixel.iter_mut().enumerate() {
-            let v = (*value + gray * (luma - *value)) / 255.0;
-            *value = 255.0 * v.max(0.0).powf(gamma) * shade * cast[c];
+            *value = curve(*value + gray * (luma - *value)) * shade * cast[c];
         }
         if invert_order {
             pixel.swap(0, 2);

@@ -115,17 +115,29 @@ struct Labelled {
     classes: Classes,
 }
 
-/// YOLO boxes: 0 hexagon (socket or head), 1 Phillips.
+/// YOLO labels, boxes or polygons: 0 hexagon (socket or head), 1 Phillips.
 fn boxes(text: &str, (width, height): (u32, u32)) -> Vec<Labelled> {
     let parse = |line: &str| {
         let v: Vec<f64> = line.split_whitespace().filter_map(|f| f.parse().ok()).collect();
-        let &[class, x, y, w, h] = v.as_slice() else { return None };
+        let (class, outline) = v.split_first()?;
+        let [x, y, w, h] = match outline {
+            &[x, y, w, h] => [x, y, w, h],
+            corners if corners.len() >= 6 && corners.len() % 2 == 0 => {
+                let extent = |first: usize| {
+                    let along = corners.iter().skip(first).step_by(2);
+                    along.fold([f64::MAX, f64::MIN], |[low, high], &c| [low.min(c), high.max(c)])
+                };
+                let ([left, right], [top, bottom]) = (extent(0), extent(1));
+                [(left + right) / 2.0, (top + bottom) / 2.0, right - left, bottom - top]
+            }
+            _ => return None,
+        };
         let (w, h) = (w * f64::from(width), h * f64::from(height));
         Some(Labelled {
             u_px: x * f64::from(width) - 0.5,
             v_px: y * f64::from(height) - 0.5,
             diameter_px: (w * h).sqrt(),
-            classes: if class == 1.0 {
+            classes: if *class == 1.0 {
                 only(Class::Cross)
             } else {
                 only(Class::HexSocket) | only(Class::HexHead) | only(Class::Torx)
@@ -160,8 +172,8 @@ fn cut(picture: &RgbImage, boxes: &[Labelled], at: [f64; 2], scale: f64, elsewhe
         .iter()
         .map(|b| {
             let label = Label {
-                u_px: ((b.u_px - at[0] + half) * scale - 0.0) as f32,
-                v_px: ((b.v_px - at[1] + half) * scale - 0.0) as f32,
+                u_px: ((b.u_px - at[0] + half) * scale) as f32,
+                v_px: ((b.v_px - at[1] + half) * scale) as f32,
                 diameter_px: (b.diameter_px * scale) as f32,
                 classes: b.classes,
                 exact: false,
@@ -175,4 +187,23 @@ fn cut(picture: &RgbImage, boxes: &[Labelled], at: [f64; 2], scale: f64, elsewhe
 
 fn text(path: &Path) -> Result<String, TrainError> {
     std::fs::read_to_string(path).map_err(|source| TrainError::Data { path: path.into(), source })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn boxes_and_polygons() {
+        let labels = boxes("1 0.5 0.25 0.1 0.1\n0 0.4 0.4 0.6 0.4 0.6 0.5 0.4 0.5\n\n1 0.5\n", (200, 100));
+        assert_eq!(labels.len(), 2);
+        assert!((labels[0].u_px - 99.5).abs() < 1e-9 && labels[0].classes == only(Class::Cross));
+        assert!((labels[1].v_px - 44.5).abs() < 1e-9 && (labels[1].diameter_px - (40.0f64 * 10.0).sqrt()).abs() < 1e-9);
+    }
+
+    #[test]
+    fn a_group_is_on_one_side() {
+        let held = (0..1000).filter(|k| held_out(&format!("screw{k:04}"))).count();
+        assert!((150..250).contains(&held), "{held} of 1000");
+    }
 }

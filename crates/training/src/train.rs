@@ -85,14 +85,14 @@ pub struct TrainSettings {
 impl Default for TrainSettings {
     fn default() -> Self {
         Self {
-            units: 170,
+            units: 150,
             background: 8,
             batch: 128,
             learning_rate: 0.01,
             decay: 0.25,
-            coarse_steps: 3000,
-            fine_steps: 6000,
-            tuning_faces: 40,
+            coarse_steps: 1900,
+            fine_steps: 2500,
+            tuning_faces: 24,
             seed: 1,
             data: PathBuf::from("crates/training/data"),
             date: String::new(),
