@@ -1,7 +1,7 @@
 //! How a unit is drawn: sheets, screws and decoys of every face from one seed.
 
 use crate::fastener::{CrossRecess, Decoy, Head, Item, Kind, Plating, Wear};
-use crate::layer::{Bump, Layer, Sheetwork, Tube};
+use crate::layer::{Bump, Layer, Sheetwork, Tube, segment_foot};
 use crate::noise::{Grain, Noise};
 use crate::paint::{Coat, Decal, Paint};
 use crate::print::Print;
@@ -496,7 +496,13 @@ impl<'a> Draft<'a> {
                 .labels
                 .iter()
                 .any(|b| b.meets(&Bounds::around(at, [radius + 1.0; 2])));
-        flat && !covered && !crowded && !labelled
+        let under_cable = self.work.tubes.iter().any(|t| {
+            t.bounds.meets(&Bounds::around(at, [radius + 1.0; 2]))
+                && t.points
+                    .windows(2)
+                    .any(|s| segment_foot(s[0], s[1], at).distance < t.radius + radius + 1.0)
+        });
+        flat && !covered && !crowded && !labelled && !under_cable
     }
 
     fn find(&self, sites: &[Site], radius: f32, on_label: bool, rng: &mut Rng) -> Option<(usize, Xy)> {

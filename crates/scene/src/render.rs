@@ -1000,9 +1000,14 @@ impl Prepared {
                 continue;
             }
             let low = (above - caster.layer.wall_mm).max(0.0);
-            let looks = if low < above - 2.0 && !own { 3 } else { 1 };
+            let looks = if low < above - 2.0 && !own {
+                // close enough together that a tall wall throws one shadow
+                3 + ((above - low) * along[0].hypot(along[1]) * 0.03).min(4.0) as usize
+            } else {
+                1
+            };
             for k in 0..looks {
-                let s = lerp(above, low, k as f32 / 2.0);
+                let s = lerp(above, low, k as f32 / (looks - 1).max(1) as f32);
                 let p = [point[0] + s * along[0], point[1] + s * along[1]];
                 let d = caster.solid_distance(p);
                 let width = softness * s + 0.25;
