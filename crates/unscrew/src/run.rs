@@ -51,6 +51,9 @@ pub struct Args {
     /// Folder of the cell's maps: calibrated on the first run, used again after that
     #[arg(long, default_value = "unscrew-cell", value_name = "DIR")]
     maps: PathBuf,
+    /// Distance between neighbouring points when a map has to be made, mm; 50 is the paper's
+    #[arg(long, default_value_t = 50.0)]
+    spacing_mm: f64,
     /// Model file; left out, the built-in one
     #[arg(long, value_name = "FILE")]
     model: Option<PathBuf>,
@@ -59,8 +62,6 @@ pub struct Args {
     json: bool,
 }
 
-/// Distance between neighbouring points of the lattice, mm: the paper's.
-const SPACING_MM: f64 = 50.0;
 /// A screw within this share of its head's diameter of a find is that find.
 const SAME: f64 = 0.5;
 
@@ -83,7 +84,7 @@ pub fn run(args: &Args) -> Result<Ended> {
     let simulated = SimulatedCell::open(settings.clone(), &args.out.join("world.jsonl"))?;
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().context("cannot start the event loop")?;
     let stop = output::stop_on_ctrl_c();
-    let (maps, calibration) = runtime.block_on(calibrated(&settings, &simulated.devices, &args.maps, &stop))?;
+    let (maps, calibration) = runtime.block_on(calibrated(&settings, &simulated.devices, args, &stop))?;
     let provenance = format!(
         "{} units of seed {}, cell seed {}, model {}, unscrew {}.",
         args.units,
@@ -128,7 +129,8 @@ pub fn run(args: &Args) -> Result<Ended> {
 }
 
 /// A map for every arm: those in the folder if they are this cell's, else captured and fitted now.
-async fn calibrated(settings: &SimSettings, real: &Devices, folder: &Path, stop: &AtomicBool) -> Result<(Vec<Map>, String)> {
+async fn calibrated(settings: &SimSettings, real: &Devices, args: &Args, stop: &AtomicBool) -> Result<(Vec<Map>, String)> {
+    let folder = &args.maps;
     let camera = camera_identity(&real.color.intrinsics());
     let (mut maps, mut notes) = (Vec::new(), Vec::new());
     for (k, arm) in real.arms.iter().enumerate() {
@@ -148,7 +150,7 @@ async fn calibrated(settings: &SimSettings, real: &Devices, folder: &Path, stop:
         let bench = SimulatedCell::new(settings.clone());
         bench.mount_jig(Some(k));
         let started_s = bench.devices.clock.now_s();
-        capture_with(&bench, k, SPACING_MM, &pairs, stop).await?;
+        capture_with(&bench, k, args.spacing_mm, &pairs, stop).await?;
         let hours = (bench.devices.clock.now_s() - started_s) / 3600.0;
         let settings = Settings { identity, date: output::now_utc(), ..Settings::default() };
         let (map, report) = Map::fit(&read_pairs(&pairs)?, &settings)?;

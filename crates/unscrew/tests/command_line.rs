@@ -1,0 +1,161 @@
+//! The command line as its users meet it: contracts of files and exit codes, and what bad input gets for an answer.
+
+use serde_json::Value;
+use std::{
+    fs,
+    path::{Path, PathBuf},
+    process::{Command, Output},
+};
+
+fn unscrew(folder: &Path, args: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_unscrew")).current_dir(folder).args(args).output().expect("the program starts")
+}
+
+/// Runs it, expects exit code 1, no panic, and a message that holds every one of `words`.
+fn refused(folder: &Path, args: &[&str], words: &[&str]) {
+    let output = unscrew(folder, args);
+    let text = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!(output.status.code(), Some(1), "{args:?}: {text}");
+    assert!(!text.contains("panicked"), "{args:?}: {text}");
+    for word in words {
+        assert!(text.contains(word), "{args:?}: '{word}' is not in: {text}");
+    }
+}
+
+fn folder() -> tempfile::TempDir {
+    tempfile::tempdir().expect("a temporary folder")
+}
+
+fn picture(path: PathBuf, width: u32, height: u32) {
+    let pixels = image::RgbImage::from_fn(width, height, |x, y| image::Rgb([120 + (x % 7) as u8, 118, 110 + (y % 5) as u8]));
+    pixels.save(path).expect("written");
+}
+
+const CAMERA: &str = "image_width: 320\nimage_height: 240\ncamera_matrix:\n  rows: 3\n  cols: 3\n  data: [400.0, 0.0, 160.0, 0.0, 400.0, 120.0, 0.0, 0.0, 1.0]\ndistortion_model: plumb_bob\ndistortion_coefficients:\n  rows: 1\n  cols: 5\n  data: [0.0, 0.0, 0.0, 0.0, 0.0]\n";
+
+#[test]
+fn bad_pictures_are_refused_by_name() {
+    let dir = folder();
+    let at = dir.path();
+    fs::write(at.join("note.jpg"), "this is text").expect("written");
+    fs::write(at.join("empty.png"), "").expect("written");
+    picture(at.join("whole.png"), 64, 48);
+    let bytes = fs::read(at.join("whole.png")).expect("read");
+    fs::write(at.join("cut.png"), &bytes[..bytes.len() / 2]).expect("written");
+    refused(at, &["detect", "note.jpg"], &["note.jpg", "not a readable picture"]);
+    refused(at, &["detect", "empty.png"], &["empty.png", "0 bytes"]);
+    refused(at, &["detect", "cut.png"], &["cut.png"]);
+    refused(at, &["detect", "missing.png"], &["missing.png"]);
+    // one bad picture does not cost the good one
+    let output = unscrew(at, &["detect", "note.jpg", "whole.png", "--json"]);
+    assert_eq!(output.status.code(), Some(1));
+    assert_eq!(String::from_utf8_lossy(&output.stdout).lines().count(), 1);
+}
+
+#[test]
+fn bad_companions_are_refused_by_name() {
+    let dir = folder();
+    let at = dir.path();
+    picture(at.join("a.png"), 320, 240);
+    image::ImageBuffer::<image::Luma<u16>, _>::from_pixel(100, 77, image::Luma([15000u16])).save(at.join("depth.png")).expect("written");
+    refused(at, &["detect", "a.png", "--depth", "depth.png"], &["depth.png", "100 x 77", "320 x 240"]);
+    fs::write(at.join("camera.yaml"), CAMERA.replace("camera_matrix", "kamera_matrix")).expect("written");
+    refused(at, &["detect", "a.png", "--camera", "camera.yaml"], &["camera.yaml", "camera_matrix"]);
+    fs::write(at.join("other.unscrew"), b"UNSCREW9\x02\0\0\0{}").expect("written");
+    refused(at, &["detect", "a.png", "--model", "other.unscrew"], &["other.unscrew", "version"]);
+    fs::write(at.join("map.json"), r#"{"format": "unscrew-map", "version": 99}"#).expect("written");
+    let all = ["detect", "a.png", "--depth", "depth.png", "--camera", "good.yaml", "--map", "map.json"];
+    fs::write(at.join("good.yaml"), CAMERA).expect("written");
+    refused(at, &all, &["map.json", "99"]);
+}
+
+#[test]
+fn an_output_folder_that_cannot_be_is_said_before_any_work() {
+    let dir = folder();
+    let at = dir.path();
+    fs::write(at.join("file"), "in the way").expect("written");
+    picture(at.join("a.png"), 64, 48);
+    refused(at, &["run", "--out", "file/out"], &["file/out", "--out"]);
+    refused(at, &["detect", "a.png", "--overlay", "file/marked"], &["file/marked"]);
+    refused(at, &["synth", "--out", "file/faces"], &["file/faces"]);
+}
+
+#[test]
+fn wrong_usage_is_exit_code_2() {
+    let dir = folder();
+    for args in [&["detect"][..], &["detect", "a.png", "--head-px", "80..15"], &["frobnicate"]] {
+        assert_eq!(unscrew(dir.path(), args).status.code(), Some(2), "{args:?}");
+    }
+}
+
+#[test]
+fn a_tiny_picture_is_a_picture() {
+    let dir = folder();
+    picture(dir.path().join("dot.png"), 1, 1);
+    let output = unscrew(dir.path(), &["detect", "dot.png", "--json"]);
+    assert_eq!(output.status.code(), Some(0), "{}", String::from_utf8_lossy(&output.stderr));
+    let line: Value = serde_json::from_slice(&output.stdout).expect("JSON");
+    assert_eq!(line["width_px"], 1);
+    assert_eq!(line["screws"], Value::Array(vec![]));
+}
+
+#[test]
+fn fit_and_apply_keep_the_contract() {
+    let dir = folder();
+    let at = dir.path();
+    // a camera that looks along +x of the base: camera x = -y, y = -z, z = x + 430; columns in another order than usual
+    let mut pairs = String::from("valid,id,cmd_z_mm,cmd_y_mm,cmd_x_mm,t_s,u_px,v_px,depth_mm,cam_x_mm,cam_y_mm,cam_z_mm,i,j,k\n");
+    let mut id = 0;
+    for i in 0..4 {
+        for j in 0..5 {
+            for k in 0..5 {
+                let (x, y, z) = (950.0 + 130.0 * f64::from(i), -450.0 + 225.0 * f64::from(j), 150.0 + 187.0 * f64::from(k));
+                let (cx, cy, cz) = (-y, 540.0 - z, x + 430.0);
+                pairs.push_str(&format!("1,{id},{z},{y},{x},{id},,,{cz},{cx},{cy},{cz},{i},{j},{k}\n"));
+                id += 1;
+            }
+        }
+    }
+    fs::write(at.join("pairs.csv"), &pairs).expect("written");
+    let fit = unscrew(at, &["calibrate", "fit", "pairs.csv", "--out", "map.json"]);
+    assert_eq!(fit.status.code(), Some(0), "{}", String::from_utf8_lossy(&fit.stderr));
+    fs::write(
+        at.join("queries.csv"),
+        "id,u_px,v_px,depth_mm,cam_x_mm,cam_y_mm,cam_z_mm,valid\n7,,,1500,20.0,-60.0,1500.0,1\n8,,,,,,,0\n9,,,9000,20.0,-60.0,9000.0,1\n",
+    )
+    .expect("written");
+    let apply = unscrew(at, &["calibrate", "apply", "--map", "map.json", "queries.csv"]);
+    let text = String::from_utf8_lossy(&apply.stdout).into_owned();
+    let lines: Vec<&str> = text.lines().collect();
+    assert_eq!(lines[0], "id,base_x_mm,base_y_mm,base_z_mm,sigma_lateral_mm,sigma_depth_mm,hull", "{text}");
+    let fields: Vec<&str> = lines[1].split(',').collect();
+    for (field, truth) in fields[1..4].iter().zip([1070.0, -20.0, 600.0]) {
+        assert!((field.parse::<f64>().expect("a number") - truth).abs() < 0.01, "{text}");
+    }
+    assert_eq!((fields[0], fields[6]), ("7", "inside"));
+    assert!(lines[2].starts_with("8,,") && lines[3].ends_with("outside"), "{text}");
+    fs::write(at.join("mixed.csv"), pairs.lines().next().unwrap_or_default()).expect("written");
+    refused(at, &["calibrate", "fit", "mixed.csv", "--out", "no.json"], &["mixed.csv"]);
+    assert!(!at.join("no.json").exists());
+}
+
+/// One whole unit, calibrated on a wide lattice: nothing the robot was sent to lies outside the calibrated volume, the page and the
+/// summary are there, a second run into the same folder is refused, and the journal's statistics are those of the summary.
+#[test]
+fn a_unit_from_end_to_end() {
+    let dir = folder();
+    let at = dir.path();
+    let output = unscrew(at, &["run", "--units", "1", "--seed", "4", "--out", "out", "--spacing-mm", "130", "--json"]);
+    let text = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(matches!(output.status.code(), Some(0 | 3)), "{text}");
+    let summary: Value = serde_json::from_slice(&output.stdout).expect("JSON");
+    assert_eq!(summary["statistics"]["units"], 1);
+    let written: Value = serde_json::from_slice(&fs::read(at.join("out/summary.json")).expect("summary")).expect("JSON");
+    assert_eq!(written, summary);
+    let page = fs::read_to_string(at.join("out/report.html")).expect("report");
+    assert!(page.contains("78.3 %") && page.contains("report/unit001-00-"));
+    let stats = unscrew(at, &["stats", "out", "--json"]);
+    let stats: Value = serde_json::from_slice(&stats.stdout).expect("JSON");
+    assert_eq!(stats, summary["statistics"]);
+    refused(at, &["run", "--units", "1", "--out", "out"], &["out", "--resume"]);
+}
