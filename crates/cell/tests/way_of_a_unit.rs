@@ -163,7 +163,7 @@ fn screws_that_lean_together_exclude_a_single_one_does_not() {
     let face = || vec![screw(-100.0, 0.0), screw(0.0, 50.0), screw(100.0, 0.0)];
     for (count, excluded) in [(3, true), (2, false)] {
         let fake = Fake::new(&[("front", face()[..count].to_vec())]);
-        fake.world().lean_rad.insert("front".into(), 9f64.to_radians());
+        fake.world().lean_rad.insert("front".into(), 11f64.to_radians());
         let record = run(&fake);
         let bent = matches!(
             record.outcome,
