@@ -75,7 +75,10 @@ fn photographs(from: &Path, to: &Path) -> Result<(), Box<dyn Error>> {
         let stem = file.strip_suffix(".jpg").ok_or("expected JPEG files")?;
         let name = format!("{scene}_{count}");
         fs::copy(from.join("images").join(file), to.join(format!("{name}.jpg")))?;
-        fs::copy(from.join("labels").join(format!("{stem}.txt")), to.join(format!("{name}.txt")))?;
+        fs::copy(
+            from.join("labels").join(format!("{stem}.txt")),
+            to.join(format!("{name}.txt")),
+        )?;
         index.push_str(&format!("{name}.jpg,{scene}\n"));
         *count += 1;
     }

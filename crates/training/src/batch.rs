@@ -77,8 +77,16 @@ fn fill(stage: Stage, patch: &Patch, rng: &mut Pcg64Mcg, pixels: &mut [f32], tar
     let mut normal = |sigma: f64| sigma * (0..4).map(|_| rng.random_range(-1.0..1.0)).sum::<f64>() * 0.866;
     // where the crop's middle comes from: near the item for what a candidate looks like, anywhere for background
     let middle = PATCH_PX as f64 / 2.0 - 0.5;
-    let focus = patch.labels.first().filter(|_| patch.focused).map(|l| [f64::from(l.u_px), f64::from(l.v_px)]);
-    let jitter = if stage == Stage::Fine && focus.is_some() { 3.5 } else { 10.0 };
+    let focus = patch
+        .labels
+        .first()
+        .filter(|_| patch.focused)
+        .map(|l| [f64::from(l.u_px), f64::from(l.v_px)]);
+    let jitter = if stage == Stage::Fine && focus.is_some() {
+        3.5
+    } else {
+        10.0
+    };
     let mut source = focus.filter(|_| stage == Stage::Fine).unwrap_or([middle, middle]);
     source = source.map(|c| c + normal(jitter).clamp(-12.0, 12.0));
     let scale = normal(0.12).exp().clamp(0.72, 1.4);
@@ -87,7 +95,11 @@ fn fill(stage: Stage, patch: &Patch, rng: &mut Pcg64Mcg, pixels: &mut [f32], tar
     let turns = rng.random_range(0..4);
     // crop pixel -> patch pixel
     let (sin, cos) = angle.sin_cos();
-    let half = if stage == Stage::Fine { CLIP_CENTER_PX as f64 } else { side as f64 / 2.0 };
+    let half = if stage == Stage::Fine {
+        CLIP_CENTER_PX as f64
+    } else {
+        side as f64 / 2.0
+    };
     let forward = move |x: f64, y: f64| {
         let (mut dx, mut dy) = (x - half, y - half);
         if flip {
@@ -96,7 +108,10 @@ fn fill(stage: Stage, patch: &Patch, rng: &mut Pcg64Mcg, pixels: &mut [f32], tar
         for _ in 0..turns {
             (dx, dy) = (-dy, dx);
         }
-        [source[0] + (cos * dx - sin * dy) / scale, source[1] + (sin * dx + cos * dy) / scale]
+        [
+            source[0] + (cos * dx - sin * dy) / scale,
+            source[1] + (sin * dx + cos * dy) / scale,
+        ]
     };
     let backward = move |u: f64, v: f64| {
         let (du, dv) = ((u - source[0]) * scale, (v - source[1]) * scale);
@@ -120,16 +135,27 @@ fn fill(stage: Stage, patch: &Patch, rng: &mut Pcg64Mcg, pixels: &mut [f32], tar
     let bytes: Vec<u8> = rgb.iter().map(|v| v.round().clamp(0.0, 255.0) as u8).collect();
     match stage {
         Stage::Fine => {
-            let Some(clip) = RgbImage::from_raw(side as u32, side as u32, bytes) else { return };
+            let Some(clip) = RgbImage::from_raw(side as u32, side as u32, bytes) else {
+                return;
+            };
             Clip::cut(&clip, Pixel::new(CLIP_CENTER_PX as f64, CLIP_CENTER_PX as f64)).network_input(pixels);
         }
-        Stage::Coarse => pixels.iter_mut().zip(bytes).for_each(|(to, from)| *to = network_value(from)),
+        Stage::Coarse => pixels
+            .iter_mut()
+            .zip(bytes)
+            .for_each(|(to, from)| *to = network_value(from)),
     }
     let cells = side / STRIDE;
     let labels: Vec<_> = patch
         .labels
         .iter()
-        .map(|l| (backward(f64::from(l.u_px), f64::from(l.v_px)), f64::from(l.diameter_px) * scale, l))
+        .map(|l| {
+            (
+                backward(f64::from(l.u_px), f64::from(l.v_px)),
+                f64::from(l.diameter_px) * scale,
+                l,
+            )
+        })
         .collect();
     for (k, target) in targets.iter_mut().enumerate() {
         let (x, y) = (cell_center_px(k % cells), cell_center_px(k / cells));
@@ -150,7 +176,11 @@ fn fill(stage: Stage, patch: &Patch, rng: &mut Pcg64Mcg, pixels: &mut [f32], tar
                 }),
             },
             Some((r, _, _, label)) if r < IGNORE_RADIUS || (label.classes == 0 && r < 0.8) => Target::default(),
-            _ => Target { classes: patch.elsewhere, weight: if stage == Stage::Fine { 0.12 } else { 0.3 }, regression: None },
+            _ => Target {
+                classes: patch.elsewhere,
+                weight: if stage == Stage::Fine { 0.12 } else { 0.3 },
+                regression: None,
+            },
         };
         if stage == Stage::Coarse && target.classes != 0 {
             coarse(target);
@@ -162,10 +192,18 @@ fn fill(stage: Stage, patch: &Patch, rng: &mut Pcg64Mcg, pixels: &mut [f32], tar
 fn coarse(target: &mut Target) {
     let fasteners = crate::samples::any_fastener();
     if target.classes & fasteners == 0 {
-        target.weight = if target.classes & only(Class::OtherFeature) != 0 { 0.4 } else { target.weight };
+        target.weight = if target.classes & only(Class::OtherFeature) != 0 {
+            0.4
+        } else {
+            target.weight
+        };
         target.classes = 0b01;
     } else if target.classes & !fasteners == 0 {
-        target.weight = if target.classes & only(Class::Cross) != 0 { 4.0 } else { 2.0 };
+        target.weight = if target.classes & only(Class::Cross) != 0 {
+            4.0
+        } else {
+            2.0
+        };
         target.classes = 0b10;
     } else {
         *target = Target::default();
@@ -190,10 +228,18 @@ fn relight(rgb: &mut [f32], side: usize, rng: &mut Pcg64Mcg) {
     let gain = rng.random_range(0.7..1.35f32);
     let gamma = rng.random_range(0.7..1.4f32);
     let cast: [f32; 3] = std::array::from_fn(|_| rng.random_range(0.85..1.18f32));
-    let gray = if rng.random_bool(0.12) { 1.0 } else { rng.random_range(0.0..0.3f32) };
+    let gray = if rng.random_bool(0.12) {
+        1.0
+    } else {
+        rng.random_range(0.0..0.3f32)
+    };
     let invert_order = rng.random_bool(0.06); // red and blue exchanged: rust must not be all there is to see
     let slope = [rng.random_range(-0.25..0.25f32), rng.random_range(-0.25..0.25f32)];
-    let noise = if rng.random_bool(0.5) { rng.random_range(0.0..7.0f32) } else { 0.0 };
+    let noise = if rng.random_bool(0.5) {
+        rng.random_range(0.0..7.0f32)
+    } else {
+        0.0
+    };
     let s = side as f32;
     let tone: [f32; 257] = std::array::from_fn(|v| 255.0 * (v as f32 / 255.0).powf(gamma));
     let curve = |v: f32| {
@@ -220,7 +266,9 @@ fn relight(rgb: &mut [f32], side: usize, rng: &mut Pcg64Mcg) {
     if noise > 0.0 {
         let mut state = rng.random::<u64>();
         for value in rgb.iter_mut() {
-            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            state = state
+                .wrapping_mul(6_364_136_223_846_793_005)
+                .wrapping_add(1_442_695_040_888_963_407);
             let part = |k: u32| ((state >> k) & 0xffff) as f32 / 65535.0 - 0.5;
             *value += noise * 1.7 * (part(48) + part(32) + part(16));
         }
@@ -233,10 +281,19 @@ fn soften(rgb: &mut [f32], side: usize, share: f32) {
     let at = |x: usize, y: usize, c: usize| from[3 * (y * side + x) + c];
     for y in 0..side {
         for x in 0..side {
-            let (l, r, t, b) = (x.saturating_sub(1), (x + 1).min(side - 1), y.saturating_sub(1), (y + 1).min(side - 1));
+            let (l, r, t, b) = (
+                x.saturating_sub(1),
+                (x + 1).min(side - 1),
+                y.saturating_sub(1),
+                (y + 1).min(side - 1),
+            );
             for c in 0..3 {
-                let mean = (at(l, y, c) + at(r, y, c) + at(x, t, c) + at(x, b, c)
-                    + 0.5 * (at(l, t, c) + at(r, t, c) + at(l, b, c) + at(r, b, c))) / 6.0;
+                let mean = (at(l, y, c)
+                    + at(r, y, c)
+                    + at(x, t, c)
+                    + at(x, b, c)
+                    + 0.5 * (at(l, t, c) + at(r, t, c) + at(l, b, c) + at(r, b, c)))
+                    / 6.0;
                 rgb[3 * (y * side + x) + c] += share * (mean - at(x, y, c));
             }
         }
@@ -245,12 +302,24 @@ fn soften(rgb: &mut [f32], side: usize, share: f32) {
 
 /// Loss and gradient over a batch: cross-entropy against sets of classes, smooth L1 for the regressions.
 pub fn loss(stage: Stage, output: &Tensor, targets: &[Target], grad: &mut Tensor) -> f32 {
-    let classes = if stage == Stage::Fine { CLASSES } else { vision::layout::COARSE_CHANNELS };
+    let classes = if stage == Stage::Fine {
+        CLASSES
+    } else {
+        vision::layout::COARSE_CHANNELS
+    };
     *grad = Tensor::zeros(output.n, output.h, output.w, output.c);
-    let total: f32 = targets.iter().filter(|t| t.classes != 0).map(|t| t.weight).sum::<f32>().max(1e-6);
+    let total: f32 = targets
+        .iter()
+        .filter(|t| t.classes != 0)
+        .map(|t| t.weight)
+        .sum::<f32>()
+        .max(1e-6);
     let known = targets.iter().filter(|t| t.regression.is_some()).count().max(1) as f32;
     let mut sum = 0.0f64;
-    let rows = output.data.chunks_exact(output.c).zip(grad.data.chunks_exact_mut(output.c));
+    let rows = output
+        .data
+        .chunks_exact(output.c)
+        .zip(grad.data.chunks_exact_mut(output.c));
     for ((z, g), target) in rows.zip(targets) {
         if target.classes != 0 {
             let w = target.weight / total;
@@ -261,10 +330,18 @@ pub fn loss(stage: Stage, output: &Tensor, targets: &[Target], grad: &mut Tensor
                 p[c] = (z[c] - high).exp();
                 norm += p[c];
             }
-            let inside: f32 = (0..classes).filter(|c| target.classes >> c & 1 == 1).map(|c| p[c]).sum::<f32>().max(1e-20);
+            let inside: f32 = (0..classes)
+                .filter(|c| target.classes >> c & 1 == 1)
+                .map(|c| p[c])
+                .sum::<f32>()
+                .max(1e-20);
             sum -= f64::from(w) * f64::from((inside / norm).ln());
             for c in 0..classes {
-                let among = if target.classes >> c & 1 == 1 { p[c] / inside } else { 0.0 };
+                let among = if target.classes >> c & 1 == 1 {
+                    p[c] / inside
+                } else {
+                    0.0
+                };
                 g[CLASS_CHANNELS.start + c] = w * (p[c] / norm - among);
             }
         }

@@ -75,26 +75,52 @@ fn place(crop: &RgbImage, head_px: f64, classes: Classes, elsewhere: Classes) ->
         }
     }
     let middle = (low as f64 + f64::from(side) / 2.0 - 0.5) as f32;
-    let label = Label { u_px: middle, v_px: middle, diameter_px: head_px as f32, classes, exact: false };
-    Patch { rgb, labels: vec![label], focused: true, elsewhere }
+    let label = Label {
+        u_px: middle,
+        v_px: middle,
+        diameter_px: head_px as f32,
+        classes,
+        exact: false,
+    };
+    Patch {
+        rgb,
+        labels: vec![label],
+        focused: true,
+        elsewhere,
+    }
 }
 
 fn photographs(folder: &Path, rng: &mut Pcg64Mcg) -> Result<Vec<Patch>, TrainError> {
     let index = text(&folder.join("index.csv"))?;
     let mut patches = Vec::new();
     for line in index.lines().skip(1) {
-        let Some((file, scene)) = line.split_once(',') else { continue };
+        let Some((file, scene)) = line.split_once(',') else {
+            continue;
+        };
         let picture = read_color(&folder.join(file))?;
         let boxes = boxes(&text(&folder.join(file.replace(".jpg", ".txt")))?, picture.dimensions());
         // not everything that turns is labelled on the hard drives: their background teaches nothing
-        let elsewhere = if scene.starts_with("harddrive") { 0 } else { only(Class::Background) | only(Class::OtherFeature) };
+        let elsewhere = if scene.starts_with("harddrive") {
+            0
+        } else {
+            only(Class::Background) | only(Class::OtherFeature)
+        };
         let mut heads: Vec<f64> = boxes.iter().map(|b| b.diameter_px).collect();
         heads.sort_by(f64::total_cmp);
-        let Some(&typical) = heads.get(heads.len() / 2) else { continue };
+        let Some(&typical) = heads.get(heads.len() / 2) else {
+            continue;
+        };
         for _ in 0..3 {
             for target in &boxes {
                 let scale = rng.random_range(20.0..40.0) / target.diameter_px;
-                patches.push(cut(&picture, &boxes, [target.u_px, target.v_px], scale, elsewhere, true));
+                patches.push(cut(
+                    &picture,
+                    &boxes,
+                    [target.u_px, target.v_px],
+                    scale,
+                    elsewhere,
+                    true,
+                ));
             }
         }
         if elsewhere != 0 {
@@ -182,11 +208,19 @@ fn cut(picture: &RgbImage, boxes: &[Labelled], at: [f64; 2], scale: f64, elsewhe
         })
         .collect();
     labels.sort_by(|a, b| a.0.total_cmp(&b.0));
-    Patch { rgb, labels: labels.into_iter().map(|l| l.1).collect(), focused, elsewhere }
+    Patch {
+        rgb,
+        labels: labels.into_iter().map(|l| l.1).collect(),
+        focused,
+        elsewhere,
+    }
 }
 
 fn text(path: &Path) -> Result<String, TrainError> {
-    std::fs::read_to_string(path).map_err(|source| TrainError::Data { path: path.into(), source })
+    std::fs::read_to_string(path).map_err(|source| TrainError::Data {
+        path: path.into(),
+        source,
+    })
 }
 
 #[cfg(test)]
@@ -195,7 +229,10 @@ mod tests {
 
     #[test]
     fn boxes_and_polygons() {
-        let labels = boxes("1 0.5 0.25 0.1 0.1\n0 0.4 0.4 0.6 0.4 0.6 0.5 0.4 0.5\n\n1 0.5\n", (200, 100));
+        let labels = boxes(
+            "1 0.5 0.25 0.1 0.1\n0 0.4 0.4 0.6 0.4 0.6 0.5 0.4 0.5\n\n1 0.5\n",
+            (200, 100),
+        );
         assert_eq!(labels.len(), 2);
         assert!((labels[0].u_px - 99.5).abs() < 1e-9 && labels[0].classes == only(Class::Cross));
         assert!((labels[1].v_px - 44.5).abs() < 1e-9 && (labels[1].diameter_px - (40.0f64 * 10.0).sqrt()).abs() < 1e-9);

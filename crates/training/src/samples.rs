@@ -67,11 +67,20 @@ pub fn decoy_class(kind: scene::fastener::Decoy) -> Class {
 
 /// Labels of a face in picture pixels.
 pub fn labels(truth: &FaceTruth) -> Vec<(Pixel, f64, Classes)> {
-    let screws = truth.screws.iter().map(|s| {
-        (s.pixel, s.head_d_px, if s.detectable { only(Class::Cross) } else { 0 })
-    });
+    let screws = truth
+        .screws
+        .iter()
+        .map(|s| (s.pixel, s.head_d_px, if s.detectable { only(Class::Cross) } else { 0 }));
     let decoys = truth.decoys.iter().map(|d| {
-        (d.pixel, d.d_px, if d.visible_fraction > 0.5 { only(decoy_class(d.kind)) } else { 0 })
+        (
+            d.pixel,
+            d.d_px,
+            if d.visible_fraction > 0.5 {
+                only(decoy_class(d.kind))
+            } else {
+                0
+            },
+        )
     });
     screws.chain(decoys).collect()
 }
@@ -80,10 +89,22 @@ pub fn labels(truth: &FaceTruth) -> Vec<(Pixel, f64, Classes)> {
 pub fn cut(view: &Prepared, all: &[(Pixel, f64, Classes)], center: Pixel, focused: bool) -> Patch {
     let roi = Roi::around(&view.view().camera, center, PATCH_PX as u32);
     let picture = view.render(Some(roi)).color;
-    from_picture(&picture, all, [f64::from(roi.x_px), f64::from(roi.y_px)], center, focused)
+    from_picture(
+        &picture,
+        all,
+        [f64::from(roi.x_px), f64::from(roi.y_px)],
+        center,
+        focused,
+    )
 }
 
-fn from_picture(picture: &RgbImage, all: &[(Pixel, f64, Classes)], corner: [f64; 2], center: Pixel, focused: bool) -> Patch {
+fn from_picture(
+    picture: &RgbImage,
+    all: &[(Pixel, f64, Classes)],
+    corner: [f64; 2],
+    center: Pixel,
+    focused: bool,
+) -> Patch {
     let margin = 24.0;
     let mut near: Vec<(f64, Label)> = all
         .iter()
@@ -132,7 +153,13 @@ pub fn rendered(seeds: std::ops::Range<u64>, background: usize, done: &(dyn Fn(u
             let mut patches = Vec::new();
             for mut view in views(seed) {
                 // some screws are out already: what they leave must not be taken for one
-                let out: Vec<_> = view.design.screws.iter().map(|s| s.id).filter(|_| rng.random_bool(0.06)).collect();
+                let out: Vec<_> = view
+                    .design
+                    .screws
+                    .iter()
+                    .map(|s| s.id)
+                    .filter(|_| rng.random_bool(0.06))
+                    .collect();
                 view.removed_screws = out;
                 let prepared = Prepared::new(&view);
                 let truth = prepared.truth();
@@ -150,7 +177,9 @@ pub fn rendered(seeds: std::ops::Range<u64>, background: usize, done: &(dyn Fn(u
                     let center = if rng.random_bool(0.8) {
                         let at = |rng: &mut Pcg64Mcg, size: f64| rng.random_range(-0.52..0.52) * size;
                         let (x, y) = (at(&mut rng, view.design.width_mm), at(&mut rng, view.design.height_mm));
-                        view.camera.project(view.camera_point(x, y, 0.0)).unwrap_or(Pixel::new(w / 2.0, h / 2.0))
+                        view.camera
+                            .project(view.camera_point(x, y, 0.0))
+                            .unwrap_or(Pixel::new(w / 2.0, h / 2.0))
                     } else {
                         Pixel::new(rng.random_range(0.0..w), rng.random_range(0.0..h))
                     };

@@ -145,10 +145,20 @@ pub fn train(settings: &TrainSettings, out: &Path, progress: &dyn Progress) -> R
     };
     let coarse = learn("coarse".into(), Stage::Coarse, settings.coarse_steps, settings.seed)?;
     let fine: Vec<Vec<u8>> = (0..ENSEMBLE)
-        .map(|k| learn(format!("fine {}", k + 1), Stage::Fine, settings.fine_steps, settings.seed + 1 + k))
+        .map(|k| {
+            learn(
+                format!("fine {}", k + 1),
+                Stage::Fine,
+                settings.fine_steps,
+                settings.seed + 1 + k,
+            )
+        })
         .collect::<Result<_, _>>()?;
     drop(patches);
-    let untuned = Settings { thresholds: Thresholds::default(), ..Settings::default() };
+    let untuned = Settings {
+        thresholds: Thresholds::default(),
+        ..Settings::default()
+    };
     let detector = Detector::from_bytes(&encode_model(&coarse, &fine, &untuned)?)?;
     let tuning = tune::tune(detector.model(), TUNING_SEEDS.start, settings.tuning_faces, &|done| {
         progress.report("tuning", done, settings.tuning_faces, None);
@@ -167,14 +177,22 @@ pub fn train(settings: &TrainSettings, out: &Path, progress: &dyn Progress) -> R
     };
     let bytes = encode_model(&coarse, &fine, &tuned)?;
     geometry::write_aside(out, &bytes)?;
-    Ok(TrainReport { model: vision::model_id(&bytes), bytes: bytes.len(), patches: counted, loss: losses, tuning })
+    Ok(TrainReport {
+        model: vision::model_id(&bytes),
+        bytes: bytes.len(),
+        patches: counted,
+        loss: losses,
+        tuning,
+    })
 }
 
 fn count(rendered: &[Patch], real: &[Patch]) -> BTreeMap<String, usize> {
     let mut counts = BTreeMap::new();
     for (origin, patches) in [("rendered", rendered), ("real", real)] {
         for patch in patches {
-            *counts.entry(format!("{origin} {}", Pool::of(patch).name())).or_default() += 1;
+            *counts
+                .entry(format!("{origin} {}", Pool::of(patch).name()))
+                .or_default() += 1;
         }
     }
     counts
@@ -191,7 +209,13 @@ enum Pool {
 }
 
 impl Pool {
-    const ALL: [Pool; 5] = [Pool::Cross, Pool::OtherDrive, Pool::OtherFeature, Pool::Background, Pool::Real];
+    const ALL: [Pool; 5] = [
+        Pool::Cross,
+        Pool::OtherDrive,
+        Pool::OtherFeature,
+        Pool::Background,
+        Pool::Real,
+    ];
 
     fn of(patch: &Patch) -> Self {
         match patch.labels.first().filter(|_| patch.focused) {
@@ -250,7 +274,14 @@ fn network(
     seed: u64,
     say: &dyn Fn(usize, f32),
 ) -> (Trainer, f32) {
-    let mut trainer = Trainer::new(if stage == Stage::Fine { fine_spec() } else { coarse_spec() }, seed);
+    let mut trainer = Trainer::new(
+        if stage == Stage::Fine {
+            fine_spec()
+        } else {
+            coarse_spec()
+        },
+        seed,
+    );
     let mut pools: Vec<(f64, Vec<usize>)> = Pool::ALL
         .iter()
         .map(|&pool| {
@@ -269,7 +300,10 @@ fn network(
         let now = loss(stage, &output, &targets, &mut grad);
         trainer.backward(&grad);
         let rise = ((step + 1) as f32 / WARM_UP as f32).min(1.0);
-        trainer.adam_step(settings.learning_rate * settings.decay.powi((3 * step / steps) as i32) * rise, 0.0);
+        trainer.adam_step(
+            settings.learning_rate * settings.decay.powi((3 * step / steps) as i32) * rise,
+            0.0,
+        );
         let memory = 0.98f32.min(step as f32 / (step as f32 + 1.0));
         mean_loss = memory * mean_loss + (1.0 - memory) * now;
         if (step + 1) % 50 == 0 || step + 1 == steps {

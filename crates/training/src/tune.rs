@@ -42,7 +42,12 @@ fn shot(seed: u64) -> Option<Shot> {
     let prepared = Prepared::new(&view);
     let truth = prepared.truth();
     let picture = prepared.render(None);
-    let frame = RgbdFrame { color: picture.color, depth: Some(picture.depth), camera: Some(view.camera), t_s: 0.0 };
+    let frame = RgbdFrame {
+        color: picture.color,
+        depth: Some(picture.depth),
+        camera: Some(view.camera),
+        t_s: 0.0,
+    };
     Some(Shot { frame, truth })
 }
 
@@ -58,8 +63,20 @@ pub fn tune(model: &Model, first_seed: u64, faces: u64, done: &dyn Fn(u64)) -> T
     let mut corrections = Corrections::default();
     cue_factors(model, &shots, &mut corrections);
     // every candidate speaks: thresholds come from what they say
-    let open = Thresholds { accept: 0.005, review: 0.004, other: 0.999_99, ..model.settings.thresholds };
-    let detector = with(model, Settings { thresholds: open, corrections, ..Settings::default() });
+    let open = Thresholds {
+        accept: 0.005,
+        review: 0.004,
+        other: 0.999_99,
+        ..model.settings.thresholds
+    };
+    let detector = with(
+        model,
+        Settings {
+            thresholds: open,
+            corrections,
+            ..Settings::default()
+        },
+    );
     let (mut scores, mut unfound, mut screws) = (Vec::new(), 0, 0);
     let (mut ratios, mut depth_ratios) = (Vec::new(), Vec::new());
     for shot in &shots {
@@ -67,7 +84,12 @@ pub fn tune(model: &Model, first_seed: u64, faces: u64, done: &dyn Fn(u64)) -> T
         screws += shot.truth.screws.iter().filter(|s| s.detectable).count();
         for truth in shot.truth.screws.iter().filter(|s| s.detectable) {
             let near = |s: &&Screw| s.pixel.distance_px(&truth.pixel) < 0.5 * truth.head_d_px;
-            match found.iter().filter(|s| s.verdict != Verdict::Other).filter(near).max_by(|a, b| a.score.total_cmp(&b.score)) {
+            match found
+                .iter()
+                .filter(|s| s.verdict != Verdict::Other)
+                .filter(near)
+                .max_by(|a, b| a.score.total_cmp(&b.score))
+            {
                 Some(find) => {
                     scores.push((find.score, true));
                     let error = errors(find.pixel, truth.pixel);
@@ -90,7 +112,11 @@ pub fn tune(model: &Model, first_seed: u64, faces: u64, done: &dyn Fn(u64)) -> T
     corrections.depth_sigma *= one_sigma(depth_ratios);
     let (accept, review, cost) = choose(&scores);
     Tuning {
-        thresholds: Thresholds { accept: accept as f32, review: review as f32, ..model.settings.thresholds },
+        thresholds: Thresholds {
+            accept: accept as f32,
+            review: review as f32,
+            ..model.settings.thresholds
+        },
         corrections,
         faces,
         screws,
@@ -126,7 +152,9 @@ fn cue_factors(model: &Model, shots: &[Shot], corrections: &mut Corrections) {
         let picture = &shot.frame.color;
         for find in detector.detect(&shot.frame, &Options::default()).screws {
             let near = |s: &&scene::ScrewTruth| s.detectable && s.pixel.distance_px(&find.pixel) < 0.5 * s.head_d_px;
-            let Some(truth) = shot.truth.screws.iter().find(near) else { continue };
+            let Some(truth) = shot.truth.screws.iter().find(near) else {
+                continue;
+            };
             if let Some(c) = outer_circle(picture, find.pixel, find.diameter_px) {
                 circles.extend(errors(c.center.pixel, truth.pixel).map(|e| e / c.center.sigma_px));
             }
@@ -145,7 +173,9 @@ fn cue_factors(model: &Model, shots: &[Shot], corrections: &mut Corrections) {
 
 /// Thresholds of least cost over all candidates: accepted and false, dropped and true, and looks in between.
 fn choose(scores: &[(f64, bool)]) -> (f64, f64, f64) {
-    let grid: Vec<f64> = (-48..=48).map(|k| 1.0 / (1.0 + (-0.125 * f64::from(k)).exp())).collect();
+    let grid: Vec<f64> = (-48..=48)
+        .map(|k| 1.0 / (1.0 + (-0.125 * f64::from(k)).exp()))
+        .collect();
     let mut best = (0.5, 0.3, f64::INFINITY);
     for (i, &accept) in grid.iter().enumerate().filter(|(_, a)| **a >= 0.3) {
         for &review in &grid[..=i] {
@@ -177,7 +207,10 @@ mod tests {
         scores.extend(vec![(0.2, false); 50]);
         scores.extend([(0.6, true), (0.6, false)]);
         let (accept, review, cost) = choose(&scores);
-        assert!(accept > 0.6 && accept <= 0.9 && review <= 0.6 && review > 0.2, "{accept} {review}");
+        assert!(
+            accept > 0.6 && accept <= 0.9 && review <= 0.6 && review > 0.2,
+            "{accept} {review}"
+        );
         assert!((cost - 2.0 * LOOK).abs() < 1e-9);
     }
 

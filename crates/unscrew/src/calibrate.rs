@@ -126,7 +126,10 @@ fn plan(args: &Plan) -> Result<Ended> {
     let corner = |k: usize| Point::<Base>::new(v[k], v[k + 1], v[k + 2]);
     let targets = calibration::lattice(&Volume::between(corner(0), corner(3)), args.spacing_mm)?;
     if args.json {
-        println!("{}", serde_json::to_string(&targets.iter().map(|t| t.command).collect::<Vec<_>>())?);
+        println!(
+            "{}",
+            serde_json::to_string(&targets.iter().map(|t| t.command).collect::<Vec<_>>())?
+        );
         return Ok(Ended::Good);
     }
     println!("id,i,j,k,cmd_x_mm,cmd_y_mm,cmd_z_mm");
@@ -135,7 +138,11 @@ fn plan(args: &Plan) -> Result<Ended> {
         println!("{},{i},{j},{k},{x:.4},{y:.4},{z:.4}", t.id);
     }
     // the paper's robot needed 4.5 h for 2,736 points
-    eprintln!("{} points, about {:.0} minutes at the paper's 5.9 s a point", targets.len(), targets.len() as f64 * 5.92 / 60.0);
+    eprintln!(
+        "{} points, about {:.0} minutes at the paper's 5.9 s a point",
+        targets.len(),
+        targets.len() as f64 * 5.92 / 60.0
+    );
     Ok(Ended::Good)
 }
 
@@ -156,7 +163,10 @@ fn fit(args: &Fit) -> Result<Ended> {
     let settings = Settings {
         method: args.method,
         as_published: args.as_published,
-        identity: Identity { arm: args.arm.clone(), camera: String::new() },
+        identity: Identity {
+            arm: args.arm.clone(),
+            camera: String::new(),
+        },
         date: output::now_utc(),
     };
     let (map, report) = Map::fit(&pairs, &settings)?;
@@ -230,5 +240,9 @@ fn check(args: &Verify) -> Result<Ended> {
     } else {
         println!("{verification}");
     }
-    Ok(if verification.passed { Ended::Good } else { Ended::NotGoodEnough })
+    Ok(if verification.passed {
+        Ended::Good
+    } else {
+        Ended::NotGoodEnough
+    })
 }

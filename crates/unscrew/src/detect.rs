@@ -49,7 +49,11 @@ pub struct Args {
 
 /// `15..80`, px.
 pub(crate) fn head_range(text: &str) -> Result<RangeInclusive<f64>, String> {
-    let parse = |t: &str| t.trim().parse::<f64>().map_err(|_| format!("'{t}' is not a number of pixels"));
+    let parse = |t: &str| {
+        t.trim()
+            .parse::<f64>()
+            .map_err(|_| format!("'{t}' is not a number of pixels"))
+    };
     let (low, high) = text.split_once("..").ok_or("expected MIN..MAX, such as 15..80")?;
     let (low, high) = (parse(low)?, parse(high.trim_start_matches('='))?);
     if !(low >= 4.0 && high >= low && high <= 2000.0) {
@@ -76,10 +80,17 @@ fn mapped(screw: &Screw, map: Option<&Map>) -> Option<Mapped> {
 
 pub fn run(args: &Args) -> Result<Ended> {
     if !args.depth.is_empty() && args.depth.len() != args.images.len() {
-        bail!("{} pictures but {} depth files; give one depth file for each picture", args.images.len(), args.depth.len());
+        bail!(
+            "{} pictures but {} depth files; give one depth file for each picture",
+            args.images.len(),
+            args.depth.len()
+        );
     }
     if !(args.depth_scale > 0.0 && args.depth_scale.is_finite()) {
-        bail!("--depth-scale {} is not a positive number of millimetres a unit", args.depth_scale);
+        bail!(
+            "--depth-scale {} is not a positive number of millimetres a unit",
+            args.depth_scale
+        );
     }
     if args.map.is_some() && (args.camera.is_none() || args.depth.is_empty()) {
         bail!("--map needs --depth and --camera: without them there is no point in space to map");
@@ -95,7 +106,10 @@ pub fn run(args: &Args) -> Result<Ended> {
     if let Some(folder) = &args.overlay {
         output::prepare_folder(folder)?;
     }
-    let options = Options { head_px: args.head_px.clone(), ..Options::default() };
+    let options = Options {
+        head_px: args.head_px.clone(),
+        ..Options::default()
+    };
     let stop = output::stop_on_ctrl_c();
     let mut failed = 0;
     let mut out = std::io::stdout().lock();
@@ -106,7 +120,10 @@ pub fn run(args: &Args) -> Result<Ended> {
         let depth = args.depth.get(k).map(|p| (p.as_path(), args.depth_scale));
         // one bad picture does not cost the others
         if let Err(error) = one(args, image, depth, &detector, &options, map.as_ref(), &mut out) {
-            if error.downcast_ref::<std::io::Error>().is_some_and(|e| e.kind() == std::io::ErrorKind::BrokenPipe) {
+            if error
+                .downcast_ref::<std::io::Error>()
+                .is_some_and(|e| e.kind() == std::io::ErrorKind::BrokenPipe)
+            {
                 return Ok(Ended::Good);
             }
             eprintln!("unscrew: {error:#}");
@@ -136,7 +153,11 @@ fn one(
     found.timing_ms.total += decode_ms;
     let name = image.display().to_string();
     if args.json {
-        writeln!(out, "{}", serde_json::to_string(&found.report(&name, |screw| mapped(screw, map)))?)?;
+        writeln!(
+            out,
+            "{}",
+            serde_json::to_string(&found.report(&name, |screw| mapped(screw, map)))?
+        )?;
     } else {
         table(out, &name, &found, map)?;
     }
@@ -163,7 +184,10 @@ fn table(out: &mut impl Write, name: &str, found: &Detections, map: Option<&Map>
     if found.screws.is_empty() {
         return Ok(());
     }
-    writeln!(out, "  verdict  drive       score      u px      v px   ± px  head px  base x, y, z mm (or camera)")?;
+    writeln!(
+        out,
+        "  verdict  drive       score      u px      v px   ± px  head px  base x, y, z mm (or camera)"
+    )?;
     for screw in &found.screws {
         let place = match (mapped(screw, map), screw.camera) {
             (Some(m), _) => {

@@ -18,7 +18,12 @@ use std::process::ExitCode;
 
 /// Finds every screw on a worn appliance, says where it is in the robot's coordinates, and takes it out.
 #[derive(Parser)]
-#[command(name = "unscrew", version, propagate_version = true, after_help = "Start with: unscrew run --units 1")]
+#[command(
+    name = "unscrew",
+    version,
+    propagate_version = true,
+    after_help = "Start with: unscrew run --units 1"
+)]
 struct Cli {
     #[command(subcommand)]
     command: Command,

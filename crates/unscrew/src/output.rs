@@ -14,7 +14,12 @@ use std::{
 
 /// Makes the folder and proves that it can be written to, before any work is spent.
 pub fn prepare_folder(folder: &Path) -> Result<()> {
-    let hint = || format!("cannot use {} as output folder; give a writable one with --out", folder.display());
+    let hint = || {
+        format!(
+            "cannot use {} as output folder; give a writable one with --out",
+            folder.display()
+        )
+    };
     fs::create_dir_all(folder).with_context(hint)?;
     // permission bits say nothing about a full disk or a read-only mount: write a block
     let probe = tempfile::NamedTempFile::new_in(folder).with_context(hint)?;

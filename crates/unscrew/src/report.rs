@@ -12,7 +12,12 @@ mod paper {
     pub const OK_IN_SCOPE: &str = "78.3 % (68.8 to 85.5)";
     pub const OK_OF_ALL: &str = "60.0 % (51.1 to 68.3)";
     pub const CYCLE: &str = "193 s";
-    pub const PARTS: [(&str, &str); 4] = [("handling", "45 s"), ("screws", "80 s"), ("covers", "45 s"), ("inspection", "30 s")];
+    pub const PARTS: [(&str, &str); 4] = [
+        ("handling", "45 s"),
+        ("screws", "80 s"),
+        ("covers", "45 s"),
+        ("inspection", "30 s"),
+    ];
 }
 
 /// A screw that truth says was on a face when it was looked at, and that was not found: known in simulation only.
@@ -92,7 +97,12 @@ pub fn write(folder: &Path, report: &Report) -> Result<()> {
 
 fn head(page: &mut String, report: &Report) -> Result<()> {
     let s = report.statistics;
-    let detected: usize = report.records.iter().flat_map(|r| &r.faces).map(|f| f.attempts.len()).sum();
+    let detected: usize = report
+        .records
+        .iter()
+        .flat_map(|r| &r.faces)
+        .map(|f| f.attempts.len())
+        .sum();
     write!(
         page,
         "<!doctype html><html lang=\"en\"><head><meta charset=\"utf-8\"><meta name=\"viewport\" content=\"width=device-width,initial-scale=1\">\
@@ -146,7 +156,11 @@ distance, not to claim it.</p>",
     if !s.causes.is_empty() {
         page.push_str("<h2>Why units were not finished</h2><table><tr><th>cause</th><th class=\"n\">units</th></tr>");
         for (cause, count) in &s.causes {
-            write!(page, "<tr><td>{}</td><td class=\"n\">{count}</td></tr>", escape(&cause.replace('_', " ")))?;
+            write!(
+                page,
+                "<tr><td>{}</td><td class=\"n\">{count}</td></tr>",
+                escape(&cause.replace('_', " "))
+            )?;
         }
         page.push_str("</table>");
     }
@@ -187,7 +201,12 @@ fn unit(page: &mut String, folder: &Path, report: &Report, record: &UnitRecord) 
         record.unit,
         escape(&detail),
         escape(record.model.as_deref().unwrap_or("model plate not readable")),
-        record.covers.iter().filter(|c| c.end == cell::record::PullEnd::Off).map(|c| 1 + c.takes_along.len()).sum::<usize>(),
+        record
+            .covers
+            .iter()
+            .filter(|c| c.end == cell::record::PullEnd::Off)
+            .map(|c| 1 + c.takes_along.len())
+            .sum::<usize>(),
         record.times.cycle_s(),
     )?;
     page.push_str("<div class=\"bar\">");
@@ -204,7 +223,10 @@ fn unit(page: &mut String, folder: &Path, report: &Report, record: &UnitRecord) 
     page.push_str("</div><div class=\"key\">");
     for (name, time_s, color) in parts(&record.times) {
         if time_s >= 0.05 {
-            write!(page, "<span><i style=\"border-color:{color};background:{color}\"></i>{name} {time_s:.1} s</span>")?;
+            write!(
+                page,
+                "<span><i style=\"border-color:{color};background:{color}\"></i>{name} {time_s:.1} s</span>"
+            )?;
         }
     }
     page.push_str("</div><div class=\"faces\">");
@@ -241,7 +263,11 @@ fn figure(
     let name = format!("unit{unit:03}-{index:02}-{}.jpg", face.face);
     let shown = shrink(folder, face, &folder.join("report").join(&name))?;
     let (w, h) = (face.width_px, face.height_px);
-    write!(page, "<figure><svg viewBox=\"0 0 {w} {h}\" role=\"img\" aria-label=\"{} of unit {unit}\">", escape(&face.face.0))?;
+    write!(
+        page,
+        "<figure><svg viewBox=\"0 0 {w} {h}\" role=\"img\" aria-label=\"{} of unit {unit}\">",
+        escape(&face.face.0)
+    )?;
     if shown {
         write!(page, "<image href=\"report/{name}\" width=\"{w}\" height=\"{h}\"/>")?;
     }
@@ -265,7 +291,11 @@ fn figure(
             m.v_px - r,
             2.0 * r,
             2.0 * r,
-            if m.detectable { "" } else { " stroke-dasharray=\"20 14\"" },
+            if m.detectable {
+                ""
+            } else {
+                " stroke-dasharray=\"20 14\""
+            },
             if m.detectable { "" } else { ": slot or head not visible" },
         )?;
     }
@@ -282,15 +312,30 @@ fn figure(
             Purpose::Missed => "looked again for missed screws".into(),
         },
         face.removed(),
-        if retries > 0 { format!(" · {retries} second attempts") } else { String::new() },
-        if review > 0 { format!(" · {review} for review") } else { String::new() },
-        if missed.is_empty() { String::new() } else { format!(" · {} missed", missed.len()) },
-        face.plane.map_or(String::new(), |p| format!(" · tilt {:.1}°", p.tilt_rad.to_degrees())),
+        if retries > 0 {
+            format!(" · {retries} second attempts")
+        } else {
+            String::new()
+        },
+        if review > 0 {
+            format!(" · {review} for review")
+        } else {
+            String::new()
+        },
+        if missed.is_empty() {
+            String::new()
+        } else {
+            format!(" · {} missed", missed.len())
+        },
+        face.plane
+            .map_or(String::new(), |p| format!(" · tilt {:.1}°", p.tilt_rad.to_degrees())),
     )?;
     if !face.found.is_empty() {
         page.push_str("<details class=\"list\"><summary>every find, with robot coordinates</summary><table><tr><th>drive</th><th>verdict</th><th class=\"n\">score</th><th class=\"n\">base x, y, z (mm)</th><th class=\"n\">± lateral, depth</th><th>result</th></tr>");
         for (k, found) in face.found.iter().enumerate() {
-            let base = found.base_mm.map_or("–".into(), |p| format!("{:.1}, {:.1}, {:.1}", p.x_mm(), p.y_mm(), p.z_mm()));
+            let base = found.base_mm.map_or("–".into(), |p| {
+                format!("{:.1}, {:.1}, {:.1}", p.x_mm(), p.y_mm(), p.z_mm())
+            });
             let sigma = match (found.sigma_lateral_mm, found.sigma_depth_mm) {
                 (Some(l), Some(d)) => format!("{l:.2}, {d:.2}"),
                 _ => "–".into(),
@@ -319,7 +364,13 @@ fn word(verdict: Verdict) -> &'static str {
 }
 
 fn tip(face: &FaceRecord, index: usize, found: &Found) -> String {
-    format!("{} ({}, {:.3}): {}", word(found.verdict), found.drive, found.score, result(face, index, found))
+    format!(
+        "{} ({}, {:.3}): {}",
+        word(found.verdict),
+        found.drive,
+        found.score,
+        result(face, index, found)
+    )
 }
 
 /// What became of a find, in words.
@@ -340,7 +391,16 @@ fn result(face: &FaceRecord, index: usize, found: &Found) -> String {
         None => "a device failed before the driver ran",
     };
     let tries = attempt.bursts.len();
-    format!("{end}, {} by {}, {:.1} s", if tries == 1 { "one attempt".into() } else { format!("{tries} attempts") }, attempt.arm, attempt.time_s())
+    format!(
+        "{end}, {} by {}, {:.1} s",
+        if tries == 1 {
+            "one attempt".into()
+        } else {
+            format!("{tries} attempts")
+        },
+        attempt.arm,
+        attempt.time_s()
+    )
 }
 
 /// A copy of the face's picture that a page can carry; false if none was kept.
@@ -361,5 +421,8 @@ fn seconds(time_s: Option<f64>) -> String {
 }
 
 fn escape(text: &str) -> String {
-    text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
+    text.replace('&', "&amp;")
+        .replace('<', "&lt;")
+        .replace('>', "&gt;")
+        .replace('"', "&quot;")
 }

@@ -8,7 +8,8 @@ use crate::{
 use anyhow::{Context, Result, bail};
 use calibration::{Identity, Map, Settings, Volume, camera_identity, lattice, read_pairs};
 use cell::{
-    CaptureSettings, CellConfig, Journal, Observer, Outcome, Program, Runner, Statistics, UnitRecord, capture_pairs as capture,
+    CaptureSettings, CellConfig, Journal, Observer, Outcome, Program, Runner, Statistics, UnitRecord,
+    capture_pairs as capture,
     config::Backend,
     device::Devices,
     record::{FaceRecord, PullEnd, Verdict},
@@ -69,7 +70,10 @@ pub fn run(args: &Args) -> Result<Ended> {
     let begin = Instant::now();
     output::prepare_folder(&args.out)?;
     if args.out.join("journal.db").exists() && !args.resume {
-        bail!("{} already holds a run; go on with it by --resume, or choose another folder with --out", args.out.display());
+        bail!(
+            "{} already holds a run; go on with it by --resume, or choose another folder with --out",
+            args.out.display()
+        );
     }
     let config = match &args.cell {
         Some(path) => CellConfig::read(path)?,
@@ -80,9 +84,15 @@ pub fn run(args: &Args) -> Result<Ended> {
         None => Detector::embedded()?,
     };
     let Backend::Simulated = config.backend;
-    let settings = SimSettings { units_seed: args.seed, ..SimSettings::from_table(&config.simulated)? };
+    let settings = SimSettings {
+        units_seed: args.seed,
+        ..SimSettings::from_table(&config.simulated)?
+    };
     let simulated = SimulatedCell::open(settings.clone(), &args.out.join("world.jsonl"))?;
-    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().context("cannot start the event loop")?;
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build()
+        .context("cannot start the event loop")?;
     let stop = output::stop_on_ctrl_c();
     let (maps, calibration) = runtime.block_on(calibrated(&settings, &simulated.devices, args, &stop))?;
     let provenance = format!(
@@ -94,12 +104,20 @@ pub fn run(args: &Args) -> Result<Ended> {
         env!("CARGO_PKG_VERSION")
     );
     let journal = Journal::open(&args.out)?;
-    let mut runner =
-        Runner::new(simulated.devices.clone(), Arc::new(detector), maps, Program::paper()?, config, journal)?;
+    let mut runner = Runner::new(
+        simulated.devices.clone(),
+        Arc::new(detector),
+        maps,
+        Program::paper()?,
+        config,
+        journal,
+    )?;
     let live = Live::new(&simulated, args.units, args.json);
     let mut records = runner.journal().records()?;
     let finish = |records: &[UnitRecord]| write_results(args, records, &live, &calibration, &provenance);
-    if args.resume && let Some(record) = runtime.block_on(runner.resume_unit(&live))? {
+    if args.resume
+        && let Some(record) = runtime.block_on(runner.resume_unit(&live))?
+    {
         records.retain(|r| r.unit != record.unit);
         records.push(record);
     }
@@ -108,7 +126,10 @@ pub fn run(args: &Args) -> Result<Ended> {
         records.push(runtime.block_on(runner.run_unit(&live))?);
         finish(&records)?; // after every unit: whatever comes, what is done can be read
         if first {
-            live.say(&format!("first unit finished {:.0} s after the start", begin.elapsed().as_secs_f64()));
+            live.say(&format!(
+                "first unit finished {:.0} s after the start",
+                begin.elapsed().as_secs_f64()
+            ));
         }
     }
     live.bar.finish_and_clear();
@@ -117,42 +138,72 @@ pub fn run(args: &Args) -> Result<Ended> {
     }
     let statistics = finish(&records)?;
     if args.json {
-        println!("{}", serde_json::to_string_pretty(&summary(&statistics, &records, &calibration))?);
+        println!(
+            "{}",
+            serde_json::to_string_pretty(&summary(&statistics, &records, &calibration))?
+        );
     } else {
         print!("{}", stats::text(&statistics));
         println!("report     {}", args.out.join("report.html").display());
     }
     if stop.load(Ordering::SeqCst) {
-        bail!("stopped after {} of {} units; go on with --resume", records.len(), args.units);
+        bail!(
+            "stopped after {} of {} units; go on with --resume",
+            records.len(),
+            args.units
+        );
     }
-    Ok(if statistics.ok == statistics.units { Ended::Good } else { Ended::NotGoodEnough })
+    Ok(if statistics.ok == statistics.units {
+        Ended::Good
+    } else {
+        Ended::NotGoodEnough
+    })
 }
 
 /// A map for every arm: those in the folder if they are this cell's, else captured and fitted now.
-async fn calibrated(settings: &SimSettings, real: &Devices, args: &Args, stop: &AtomicBool) -> Result<(Vec<Map>, String)> {
+async fn calibrated(
+    settings: &SimSettings,
+    real: &Devices,
+    args: &Args,
+    stop: &AtomicBool,
+) -> Result<(Vec<Map>, String)> {
     let folder = &args.maps;
     let camera = camera_identity(&real.color.intrinsics());
     let (mut maps, mut notes) = (Vec::new(), Vec::new());
     for (k, arm) in real.arms.iter().enumerate() {
         let name = arm.robot.name().to_owned();
-        let identity = Identity { arm: format!("{name} of simulated cell {}", settings.seed), camera: camera.clone() };
+        let identity = Identity {
+            arm: format!("{name} of simulated cell {}", settings.seed),
+            camera: camera.clone(),
+        };
         let path = folder.join(format!("map_{name}.json"));
         if path.exists() {
             let map = Map::load_for(&path, &identity)?;
-            notes.push(format!("{name}: map of {}, {} pairs", map.settings().date, map.n_used()));
+            notes.push(format!(
+                "{name}: map of {}, {} pairs",
+                map.settings().date,
+                map.n_used()
+            ));
             maps.push(map);
             continue;
         }
         output::prepare_folder(folder)?;
         let pairs = folder.join(format!("pairs_{name}.csv"));
-        eprintln!("unscrew: {name} has no map in {} yet: calibrating it once", folder.display());
+        eprintln!(
+            "unscrew: {name} has no map in {} yet: calibrating it once",
+            folder.display()
+        );
         // a cell of the same seed with an empty table: what a person prepares before a calibration
         let bench = SimulatedCell::new(settings.clone());
         bench.mount_jig(Some(k));
         let started_s = bench.devices.clock.now_s();
         capture_with(&bench, k, args.spacing_mm, &pairs, stop).await?;
         let hours = (bench.devices.clock.now_s() - started_s) / 3600.0;
-        let settings = Settings { identity, date: output::now_utc(), ..Settings::default() };
+        let settings = Settings {
+            identity,
+            date: output::now_utc(),
+            ..Settings::default()
+        };
         let (map, report) = Map::fit(&read_pairs(&pairs)?, &settings)?;
         map.save(&path)?;
         let note = format!(
@@ -170,21 +221,37 @@ async fn calibrated(settings: &SimSettings, real: &Devices, args: &Args, stop: &
     Ok((maps, format!("Calibration: {}.", notes.join("; "))))
 }
 
-async fn capture_with(bench: &SimulatedCell, arm: usize, spacing_mm: f64, path: &Path, stop: &AtomicBool) -> Result<()> {
+async fn capture_with(
+    bench: &SimulatedCell,
+    arm: usize,
+    spacing_mm: f64,
+    path: &Path,
+    stop: &AtomicBool,
+) -> Result<()> {
     let [low, high] = sim::layout::volume(arm);
     let plan = lattice(&Volume::between(low, high), spacing_mm)?;
     let Some(approach) = Direction::<Base>::new(1.0, 0.0, 0.0) else {
         bail!("the approach has no direction");
     };
     let bar = output::progress(plan.len() as u64, "calibrating");
-    let summary = capture(&bench.devices, arm, &plan, &CaptureSettings::along(approach), path, |visit| {
-        bar.set_position(visit.done as u64);
-        !stop.load(Ordering::SeqCst)
-    })
+    let summary = capture(
+        &bench.devices,
+        arm,
+        &plan,
+        &CaptureSettings::along(approach),
+        path,
+        |visit| {
+            bar.set_position(visit.done as u64);
+            !stop.load(Ordering::SeqCst)
+        },
+    )
     .await?;
     bar.finish_and_clear();
     if !summary.complete {
-        bail!("calibration stopped after {} visits; run again to go on from there", summary.visits);
+        bail!(
+            "calibration stopped after {} visits; run again to go on from there",
+            summary.visits
+        );
     }
     Ok(())
 }
@@ -198,13 +265,19 @@ pub struct Captured {
 
 /// Captures pairs of one arm of the simulated cell: `unscrew calibrate capture`.
 pub fn capture_pairs(cell_seed: u64, arm: &str, spacing_mm: f64, path: &Path) -> Result<Captured> {
-    let bench = SimulatedCell::new(SimSettings { seed: cell_seed, ..SimSettings::default() });
+    let bench = SimulatedCell::new(SimSettings {
+        seed: cell_seed,
+        ..SimSettings::default()
+    });
     let names: Vec<String> = bench.devices.arms.iter().map(|a| a.robot.name().to_owned()).collect();
     let Some(k) = names.iter().position(|n| n == arm) else {
         bail!("the cell has no arm '{arm}'; it has {}", names.join(", "));
     };
     bench.mount_jig(Some(k));
-    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().context("cannot start the event loop")?;
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build()
+        .context("cannot start the event loop")?;
     let stop = output::stop_on_ctrl_c();
     runtime.block_on(capture_with(&bench, k, spacing_mm, path, &stop))?;
     let pairs = read_pairs(path)?;
@@ -278,7 +351,8 @@ impl Observer for Live<'_> {
     }
 
     fn screw(&self, screw: usize, of: usize) {
-        self.bar.set_message(format!("{}, screw {}/{of}", self.step.borrow(), screw + 1));
+        self.bar
+            .set_message(format!("{}, screw {}/{of}", self.step.borrow(), screw + 1));
     }
 
     fn finished(&self, record: &UnitRecord) {
@@ -289,7 +363,12 @@ impl Observer for Live<'_> {
             record.unit,
             record.model.as_deref().unwrap_or("model unknown"),
             record.faces.iter().map(FaceRecord::removed).sum::<usize>(),
-            record.covers.iter().filter(|c| c.end == PullEnd::Off).map(|c| 1 + c.takes_along.len()).sum::<usize>(),
+            record
+                .covers
+                .iter()
+                .filter(|c| c.end == PullEnd::Off)
+                .map(|c| 1 + c.takes_along.len())
+                .sum::<usize>(),
             record.times.cycle_s()
         ));
     }
@@ -322,13 +401,32 @@ fn summary<'a>(statistics: &'a Statistics, records: &'a [UnitRecord], calibratio
         cycle_s: r.times.cycle_s(),
         times: &r.times,
     };
-    Summary { statistics, calibration, units: records.iter().map(line).collect() }
+    Summary {
+        statistics,
+        calibration,
+        units: records.iter().map(line).collect(),
+    }
 }
 
-fn write_results(args: &Args, records: &[UnitRecord], live: &Live, calibration: &str, provenance: &str) -> Result<Statistics> {
+fn write_results(
+    args: &Args,
+    records: &[UnitRecord],
+    live: &Live,
+    calibration: &str,
+    provenance: &str,
+) -> Result<Statistics> {
     let statistics = Statistics::over(records);
-    let page = Report { records, statistics: &statistics, calibration, provenance, missed: &live.missed.borrow() };
+    let page = Report {
+        records,
+        statistics: &statistics,
+        calibration,
+        provenance,
+        missed: &live.missed.borrow(),
+    };
     report::write(&args.out, &page)?;
-    output::write_json(&args.out.join("summary.json"), &summary(&statistics, records, calibration))?;
+    output::write_json(
+        &args.out.join("summary.json"),
+        &summary(&statistics, records, calibration),
+    )?;
     Ok(statistics)
 }

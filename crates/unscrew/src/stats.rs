@@ -31,7 +31,14 @@ pub fn run(args: &Args) -> Result<Ended> {
 /// The statistics as a table for a terminal.
 pub fn text(s: &Statistics) -> String {
     let rate = |r: &cell::statistics::Rate| match r.rate {
-        Some(p) => format!("{:5.1} %  ({} of {}; 95 %: {:.1} to {:.1} %)", 100.0 * p, r.hits, r.of, 100.0 * r.low, 100.0 * r.high),
+        Some(p) => format!(
+            "{:5.1} %  ({} of {}; 95 %: {:.1} to {:.1} %)",
+            100.0 * p,
+            r.hits,
+            r.of,
+            100.0 * r.low,
+            100.0 * r.high
+        ),
         None => "    -".into(),
     };
     let time = |t: Option<f64>| t.map_or("    -".into(), |t| format!("{t:5.1} s"));

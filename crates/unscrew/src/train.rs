@@ -83,7 +83,9 @@ pub fn run(args: &Args) -> Result<Ended> {
         ..TrainSettings::default()
     };
     let begin = Instant::now();
-    let bars = Bars { now: Mutex::new((String::new(), ProgressBar::hidden(), Instant::now())) };
+    let bars = Bars {
+        now: Mutex::new((String::new(), ProgressBar::hidden(), Instant::now())),
+    };
     let report = train(&settings, &args.out, &bars).context("training")?;
     if args.json {
         println!("{}", serde_json::to_string_pretty(&report)?);
@@ -100,6 +102,12 @@ pub fn run(args: &Args) -> Result<Ended> {
         "on {} faces not learned from: {} detectable screws, {} without a candidate; accept from {:.3}, review from {:.3}",
         t.faces, t.screws, t.without_candidate, t.thresholds.accept, t.thresholds.review
     );
-    println!("{} ({} bytes, {}) after {:.0} min", args.out.display(), report.bytes, report.model, begin.elapsed().as_secs_f64() / 60.0);
+    println!(
+        "{} ({} bytes, {}) after {:.0} min",
+        args.out.display(),
+        report.bytes,
+        report.model,
+        begin.elapsed().as_secs_f64() / 60.0
+    );
     Ok(Ended::Good)
 }

@@ -8,7 +8,11 @@ use std::{
 };
 
 fn unscrew(folder: &Path, args: &[&str]) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_unscrew")).current_dir(folder).args(args).output().expect("the program starts")
+    Command::new(env!("CARGO_BIN_EXE_unscrew"))
+        .current_dir(folder)
+        .args(args)
+        .output()
+        .expect("the program starts")
 }
 
 /// Runs it, expects exit code 1, no panic, and a message that holds every one of `words`.
@@ -27,7 +31,9 @@ fn folder() -> tempfile::TempDir {
 }
 
 fn picture(path: PathBuf, width: u32, height: u32) {
-    let pixels = image::RgbImage::from_fn(width, height, |x, y| image::Rgb([120 + (x % 7) as u8, 118, 110 + (y % 5) as u8]));
+    let pixels = image::RgbImage::from_fn(width, height, |x, y| {
+        image::Rgb([120 + (x % 7) as u8, 118, 110 + (y % 5) as u8])
+    });
     pixels.save(path).expect("written");
 }
 
@@ -57,14 +63,37 @@ fn bad_companions_are_refused_by_name() {
     let dir = folder();
     let at = dir.path();
     picture(at.join("a.png"), 320, 240);
-    image::ImageBuffer::<image::Luma<u16>, _>::from_pixel(100, 77, image::Luma([15000u16])).save(at.join("depth.png")).expect("written");
-    refused(at, &["detect", "a.png", "--depth", "depth.png"], &["depth.png", "100 x 77", "320 x 240"]);
+    image::ImageBuffer::<image::Luma<u16>, _>::from_pixel(100, 77, image::Luma([15000u16]))
+        .save(at.join("depth.png"))
+        .expect("written");
+    refused(
+        at,
+        &["detect", "a.png", "--depth", "depth.png"],
+        &["depth.png", "100 x 77", "320 x 240"],
+    );
     fs::write(at.join("camera.yaml"), CAMERA.replace("camera_matrix", "kamera_matrix")).expect("written");
-    refused(at, &["detect", "a.png", "--camera", "camera.yaml"], &["camera.yaml", "camera_matrix"]);
+    refused(
+        at,
+        &["detect", "a.png", "--camera", "camera.yaml"],
+        &["camera.yaml", "camera_matrix"],
+    );
     fs::write(at.join("other.unscrew"), b"UNSCREW9\x02\0\0\0{}").expect("written");
-    refused(at, &["detect", "a.png", "--model", "other.unscrew"], &["other.unscrew", "version"]);
+    refused(
+        at,
+        &["detect", "a.png", "--model", "other.unscrew"],
+        &["other.unscrew", "version"],
+    );
     fs::write(at.join("map.json"), r#"{"format": "unscrew-map", "version": 99}"#).expect("written");
-    let all = ["detect", "a.png", "--depth", "depth.png", "--camera", "good.yaml", "--map", "map.json"];
+    let all = [
+        "detect",
+        "a.png",
+        "--depth",
+        "depth.png",
+        "--camera",
+        "good.yaml",
+        "--map",
+        "map.json",
+    ];
     fs::write(at.join("good.yaml"), CAMERA).expect("written");
     refused(at, &all, &["map.json", "99"]);
 }
@@ -83,7 +112,11 @@ fn an_output_folder_that_cannot_be_is_said_before_any_work() {
 #[test]
 fn wrong_usage_is_exit_code_2() {
     let dir = folder();
-    for args in [&["detect"][..], &["detect", "a.png", "--head-px", "80..15"], &["frobnicate"]] {
+    for args in [
+        &["detect"][..],
+        &["detect", "a.png", "--head-px", "80..15"],
+        &["frobnicate"],
+    ] {
         assert_eq!(unscrew(dir.path(), args).status.code(), Some(2), "{args:?}");
     }
 }
@@ -93,7 +126,12 @@ fn a_tiny_picture_is_a_picture() {
     let dir = folder();
     picture(dir.path().join("dot.png"), 1, 1);
     let output = unscrew(dir.path(), &["detect", "dot.png", "--json"]);
-    assert_eq!(output.status.code(), Some(0), "{}", String::from_utf8_lossy(&output.stderr));
+    assert_eq!(
+        output.status.code(),
+        Some(0),
+        "{}",
+        String::from_utf8_lossy(&output.stderr)
+    );
     let line: Value = serde_json::from_slice(&output.stdout).expect("JSON");
     assert_eq!(line["width_px"], 1);
     assert_eq!(line["screws"], Value::Array(vec![]));
@@ -104,12 +142,17 @@ fn fit_and_apply_keep_the_contract() {
     let dir = folder();
     let at = dir.path();
     // a camera that looks along +x of the base: camera x = -y, y = -z, z = x + 430; columns in another order than usual
-    let mut pairs = String::from("valid,id,cmd_z_mm,cmd_y_mm,cmd_x_mm,t_s,u_px,v_px,depth_mm,cam_x_mm,cam_y_mm,cam_z_mm,i,j,k\n");
+    let mut pairs =
+        String::from("valid,id,cmd_z_mm,cmd_y_mm,cmd_x_mm,t_s,u_px,v_px,depth_mm,cam_x_mm,cam_y_mm,cam_z_mm,i,j,k\n");
     let mut id = 0;
     for i in 0..4 {
         for j in 0..5 {
             for k in 0..5 {
-                let (x, y, z) = (950.0 + 130.0 * f64::from(i), -450.0 + 225.0 * f64::from(j), 150.0 + 187.0 * f64::from(k));
+                let (x, y, z) = (
+                    950.0 + 130.0 * f64::from(i),
+                    -450.0 + 225.0 * f64::from(j),
+                    150.0 + 187.0 * f64::from(k),
+                );
                 let (cx, cy, cz) = (-y, 540.0 - z, x + 430.0);
                 pairs.push_str(&format!("1,{id},{z},{y},{x},{id},,,{cz},{cx},{cy},{cz},{i},{j},{k}\n"));
                 id += 1;
@@ -127,7 +170,10 @@ fn fit_and_apply_keep_the_contract() {
     let apply = unscrew(at, &["calibrate", "apply", "--map", "map.json", "queries.csv"]);
     let text = String::from_utf8_lossy(&apply.stdout).into_owned();
     let lines: Vec<&str> = text.lines().collect();
-    assert_eq!(lines[0], "id,base_x_mm,base_y_mm,base_z_mm,sigma_lateral_mm,sigma_depth_mm,hull", "{text}");
+    assert_eq!(
+        lines[0], "id,base_x_mm,base_y_mm,base_z_mm,sigma_lateral_mm,sigma_depth_mm,hull",
+        "{text}"
+    );
     let fields: Vec<&str> = lines[1].split(',').collect();
     for (field, truth) in fields[1..4].iter().zip([1070.0, -20.0, 600.0]) {
         assert!((field.parse::<f64>().expect("a number") - truth).abs() < 0.01, "{text}");
@@ -135,7 +181,11 @@ fn fit_and_apply_keep_the_contract() {
     assert_eq!((fields[0], fields[6]), ("7", "inside"));
     assert!(lines[2].starts_with("8,,") && lines[3].ends_with("outside"), "{text}");
     fs::write(at.join("mixed.csv"), pairs.lines().next().unwrap_or_default()).expect("written");
-    refused(at, &["calibrate", "fit", "mixed.csv", "--out", "no.json"], &["mixed.csv"]);
+    refused(
+        at,
+        &["calibrate", "fit", "mixed.csv", "--out", "no.json"],
+        &["mixed.csv"],
+    );
     assert!(!at.join("no.json").exists());
 }
 
@@ -145,12 +195,27 @@ fn fit_and_apply_keep_the_contract() {
 fn a_unit_from_end_to_end() {
     let dir = folder();
     let at = dir.path();
-    let output = unscrew(at, &["run", "--units", "1", "--seed", "4", "--out", "out", "--spacing-mm", "130", "--json"]);
+    let output = unscrew(
+        at,
+        &[
+            "run",
+            "--units",
+            "1",
+            "--seed",
+            "4",
+            "--out",
+            "out",
+            "--spacing-mm",
+            "130",
+            "--json",
+        ],
+    );
     let text = String::from_utf8_lossy(&output.stderr).into_owned();
     assert!(matches!(output.status.code(), Some(0 | 3)), "{text}");
     let summary: Value = serde_json::from_slice(&output.stdout).expect("JSON");
     assert_eq!(summary["statistics"]["units"], 1);
-    let written: Value = serde_json::from_slice(&fs::read(at.join("out/summary.json")).expect("summary")).expect("JSON");
+    let written: Value =
+        serde_json::from_slice(&fs::read(at.join("out/summary.json")).expect("summary")).expect("JSON");
     assert_eq!(written, summary);
     let page = fs::read_to_string(at.join("out/report.html")).expect("report");
     assert!(page.contains("78.3 %") && page.contains("report/unit001-00-"));
