@@ -41,7 +41,9 @@ pub(crate) fn surround(sheetwork: &mut Sheetwork, design: &FaceDesign, rng: &mut
         gray(level, rng)
     };
     let mud = gray(0.1, rng);
-    let paint = Paint::new(coat, color, rough, rng).worn(rng.random_range(0.05..0.45), mud, 0.0, rng);
+    let paint = Paint::new(coat, color, rough, rng)
+        .far(rng)
+        .worn(rng.random_range(0.05..0.45), mud, 0.0, rng);
     let mut wall = Layer::new(Shape::rect([0.0; 2], [6000.0; 2], 0.0), back, 0.0, 0.0, paint);
     // joints of tiles, boards or plates; T-slots of a table
     if rng.random_bool(0.6) {
@@ -102,7 +104,7 @@ pub(crate) fn surround(sheetwork: &mut Sheetwork, design: &FaceDesign, rng: &mut
         } else {
             Coat::Painted
         };
-        let paint = Paint::new(coat, color, rng.random_range(0.3..0.8), rng).worn(
+        let paint = Paint::new(coat, color, rng.random_range(0.3..0.8), rng).far(rng).worn(
             rng.random_range(0.0..0.6),
             mud,
             rng.random_range(0.0..0.3),
@@ -155,7 +157,9 @@ pub(crate) fn surround(sheetwork: &mut Sheetwork, design: &FaceDesign, rng: &mut
         };
         let level = rng.random_range(0.1..0.6);
         let color = gray(level, rng);
-        let paint = Paint::new(Coat::Zinc, color, rng.random_range(0.3..0.6), rng).worn(0.3, mud, 0.1, rng);
+        let paint = Paint::new(Coat::Zinc, color, rng.random_range(0.3..0.6), rng)
+            .far(rng)
+            .worn(0.3, mud, 0.1, rng);
         let top = -rng.random_range(4.0..60.0f32);
         sheetwork
             .layers
@@ -164,7 +168,9 @@ pub(crate) fn surround(sheetwork: &mut Sheetwork, design: &FaceDesign, rng: &mut
     // hoses on the ground
     for _ in 0..rng.random_range(0..3) {
         let color = [[0.03, 0.03, 0.03], [0.5, 0.3, 0.02], [0.03, 0.1, 0.3]][rng.random_range(0..3)];
-        let paint = Paint::new(Coat::Plastic, color, 0.6, rng).worn(0.3, mud, 0.0, rng);
+        let paint = Paint::new(Coat::Plastic, color, 0.6, rng)
+            .far(rng)
+            .worn(0.3, mud, 0.0, rng);
         let radius = rng.random_range(4.0..12.0f32);
         let from = [rng.random_range(-900.0..900.0f32), -900.0];
         let bend = rng.random_range(-500.0..500.0f32);

@@ -76,6 +76,12 @@ impl Paint {
         }
     }
 
+    /// For what lies around the face: its grain is coarser, so that the noise reaches that far.
+    pub fn far<R: RngExt + ?Sized>(mut self, rng: &mut R) -> Self {
+        self.fine = Noise::new(Grain::Even, 5.0, rng);
+        self
+    }
+
     /// With grime of this amount, and rust.
     pub fn worn<R: RngExt + ?Sized>(mut self, dirt: f32, soil: [f32; 3], rust: f32, rng: &mut R) -> Self {
         self.dirt = dirt;
@@ -84,7 +90,7 @@ impl Paint {
             self.rust = Some(Rust {
                 amount: rust,
                 place: Noise::new(Grain::Cloud, rng.random_range(50.0..150.0), rng),
-                grain: Noise::new(Grain::Cloud, 7.0, rng),
+                grain: Noise::new(Grain::Cloud, 14.0, rng),
                 body: Texture::new(Surface::Rust, rng.random_range(0.12..0.3), rng),
             });
         }
@@ -243,8 +249,8 @@ impl Decal {
                 }
                 let t = (dy / length).max(0.0);
                 // threads: noise drawn out downward
-                let thread = ragged.at(p[0], 0.12 * p[1]);
-                let half = width * (0.5 + 0.6 * t) * (0.6 + 0.8 * ragged.at(p[0] * 0.3 + 50.0, 0.03 * p[1]));
+                let thread = ragged.at(dx, 0.12 * dy);
+                let half = width * (0.5 + 0.6 * t) * (0.6 + 0.8 * ragged.at(dx * 0.3 + 50.0, 0.03 * dy));
                 let across = 1.0 - smoothstep(0.3 * half, half, dx.abs());
                 let cover = strength * across * (1.0 - t).powf(0.8) * smoothstep(0.15, 0.75, thread);
                 let cover = cover.clamp(0.0, 0.9);
@@ -260,7 +266,7 @@ impl Decal {
                 ragged,
             } => {
                 let r = (p[0] - center[0]).hypot(p[1] - center[1]) / radius;
-                let level = 1.15 - r + 0.9 * (ragged.at(p[0], p[1]) - 0.5);
+                let level = 1.15 - r + 0.9 * (ragged.at(p[0] - center[0], p[1] - center[1]) - 0.5);
                 let cover = strength * smoothstep(0.1, 0.6, level);
                 under.albedo = mix(under.albedo, *color, cover);
                 under.roughness += cover * (0.9 - under.roughness);

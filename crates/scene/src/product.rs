@@ -175,14 +175,19 @@ pub struct FaceDesign {
 }
 
 impl FaceDesign {
-    /// Reflectance of its largest sheet, 0 black to 1 white.
+    /// Reflectance of the brightest of its large sheets, 0 black to 1 white.
     pub fn brightness(&self) -> f32 {
         let size = |b: &crate::shape::Bounds| (b.high[0] - b.low[0]) * (b.high[1] - b.low[1]);
-        let layers = self.sheetwork.layers.iter();
-        let largest = layers.max_by(|a, b| size(&a.bounds).total_cmp(&size(&b.bounds)));
-        largest.map_or(0.5, |l| {
-            0.3 * l.paint.albedo[0] + 0.59 * l.paint.albedo[1] + 0.11 * l.paint.albedo[2]
-        })
+        let largest = self
+            .sheetwork
+            .layers
+            .iter()
+            .map(|l| size(&l.bounds))
+            .fold(0.0, f32::max);
+        let large = self.sheetwork.layers.iter().filter(|l| size(&l.bounds) > 0.5 * largest);
+        large
+            .map(|l| 0.3 * l.paint.albedo[0] + 0.59 * l.paint.albedo[1] + 0.11 * l.paint.albedo[2])
+            .fold(0.0, f32::max)
     }
 }
 
