@@ -31,7 +31,7 @@ frames! {
     Table = "table";
     /// An outdoor unit.
     Unit = "unit";
-    /// One face of a unit: x right, y down, z out of the sheet towards the viewer.
+    /// One face of a unit: x right, y down, z into the sheet (heights above it are negative).
     Face = "face";
 }
 

@@ -146,7 +146,7 @@ impl Gp25 {
             .solver
             .inverse_continuing(&pose, &WORK_RAD)
             .into_iter()
-            .filter(|q| within_limits(q))
+            .filter(within_limits)
             .min_by(|a, b| strangeness(a).total_cmp(&strangeness(b)))
             .ok_or(Unreachable::OutOfReach(t.x, t.y, t.z))?;
         if joints[4].sin().abs() < WRIST_MARGIN_RAD.sin() {

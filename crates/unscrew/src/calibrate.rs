@@ -230,7 +230,7 @@ fn apply(args: &Apply) -> Result<Ended> {
 }
 
 fn check(args: &Verify) -> Result<Ended> {
-    if !(args.limit_mm > 0.0) {
+    if args.limit_mm.is_nan() || args.limit_mm <= 0.0 {
         bail!("--limit-mm {} is not a positive number of millimetres", args.limit_mm);
     }
     let map = Map::load(&args.map)?;
