@@ -675,8 +675,15 @@ impl Trainer {
     /// # Errors
     /// An [`NnError`] that says what is wrong with the file.
     pub fn load_checkpoint(path: impl AsRef<Path>) -> Result<Self, NnError> {
-        let bytes = read(path.as_ref())?;
-        let reader = Reader::new(&bytes)?;
+        Self::from_bytes(&read(path.as_ref())?)
+    }
+
+    /// As [`load_checkpoint`](Self::load_checkpoint), from the bytes of such a file.
+    ///
+    /// # Errors
+    /// An [`NnError`] that says what is wrong with them.
+    pub fn from_bytes(bytes: &[u8]) -> Result<Self, NnError> {
+        let reader = Reader::new(bytes)?;
         let mut trainer = Self::from_parameters(reader.spec.clone(), read_parameters(&reader)?);
         let Some(steps) = reader.metadata.get(STEPS) else {
             return Ok(trainer);

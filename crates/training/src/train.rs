@@ -15,7 +15,7 @@ use std::{
     path::{Path, PathBuf},
 };
 use vision::layout::{Class, coarse_spec, fine_spec};
-use vision::{Detector, Settings, Thresholds, encode_model};
+use vision::{Detector, Settings, Thresholds, decode_model, encode_model};
 
 /// Networks in the ensemble of stage 2, as in the paper.
 const ENSEMBLE: u64 = 3;
@@ -57,6 +57,8 @@ pub enum TrainError {
 /// The recipe. Optimiser, batch, loss and steps of the learning rate are the paper's (section 4.2).
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct TrainSettings {
+    /// Seed of the first unit.
+    pub first_unit: u64,
     /// Units whose five faces are rendered to learn from.
     pub units: u64,
     /// Patches of background a face.
@@ -75,6 +77,11 @@ pub struct TrainSettings {
     pub tuning_faces: u64,
     /// Seed of everything.
     pub seed: u64,
+    /// Model whose networks are trained further; `None` starts anew. A network with 0 steps stays as it is.
+    #[serde(skip)]
+    pub from: Option<PathBuf>,
+    /// Identity of that model.
+    pub from_model: Option<String>,
     /// Folder of the real photographs.
     #[serde(skip)]
     pub data: PathBuf,
@@ -85,6 +92,7 @@ pub struct TrainSettings {
 impl Default for TrainSettings {
     fn default() -> Self {
         Self {
+            first_unit: 0,
             units: 150,
             background: 8,
             batch: 128,
@@ -94,6 +102,8 @@ impl Default for TrainSettings {
             fine_steps: 2500,
             tuning_faces: 24,
             seed: 1,
+            from: None,
+            from_model: None,
             data: PathBuf::from("crates/training/data"),
             date: String::new(),
         }
@@ -126,28 +136,41 @@ pub struct TrainReport {
 /// # Errors
 /// [`TrainError`] if the real photographs cannot be read or the file cannot be written.
 pub fn train(settings: &TrainSettings, out: &Path, progress: &dyn Progress) -> Result<TrainReport, TrainError> {
-    if settings.units > TRAINING_SEEDS.end {
+    if settings.first_unit.saturating_add(settings.units) > TRAINING_SEEDS.end {
         return Err(TrainError::TooManyUnits { units: settings.units });
     }
     let real = real::patches(&settings.data, settings.seed)?; // first: a missing folder is said at once
-    let mut patches = rendered(0..settings.units, settings.background, &|done| {
-        progress.report("rendering", done, settings.units, None);
-    });
+    let (settings, start) = &begun(settings)?;
+    let mut patches = rendered(
+        settings.first_unit..settings.first_unit + settings.units,
+        settings.background,
+        &|done| {
+            progress.report("rendering", done, settings.units, None);
+        },
+    );
     let counted = count(&patches, &real);
     patches.extend(real);
     let mut losses = BTreeMap::new();
     let mut learn = |name: String, stage, steps, seed| {
-        let (trainer, loss) = network(stage, &patches, settings, steps, seed, &|done, loss| {
-            progress.report(&name, done as u64, steps as u64, Some(loss));
-        });
+        let (trainer, loss) = network(
+            trainer(start, &name, stage, seed)?,
+            stage,
+            &patches,
+            settings,
+            steps,
+            seed,
+            &|done, loss| {
+                progress.report(&name, done as u64, steps as u64, Some(loss));
+            },
+        );
         losses.insert(name, loss);
-        trainer.to_bytes(&BTreeMap::new())
+        Ok::<_, TrainError>(trainer.to_bytes(&BTreeMap::new())?)
     };
-    let coarse = learn("coarse".into(), Stage::Coarse, settings.coarse_steps, settings.seed)?;
+    let coarse = learn("coarse".to_owned(), Stage::Coarse, settings.coarse_steps, settings.seed)?;
     let fine: Vec<Vec<u8>> = (0..ENSEMBLE)
         .map(|k| {
             learn(
-                format!("fine {}", k + 1),
+                format!("fine{k}"),
                 Stage::Fine,
                 settings.fine_steps,
                 settings.seed + 1 + k,
@@ -266,7 +289,40 @@ fn picks(pools: &[(f64, Vec<usize>)], n: usize, rng: &mut Pcg64Mcg) -> Vec<usize
         .collect()
 }
 
+/// Settings with the identity of the model that is trained further, and that model's networks by name.
+fn begun(settings: &TrainSettings) -> Result<(TrainSettings, BTreeMap<String, Vec<u8>>), TrainError> {
+    let Some(path) = &settings.from else {
+        return Ok((settings.clone(), BTreeMap::new()));
+    };
+    let bytes = std::fs::read(path).map_err(|source| TrainError::Data {
+        path: path.clone(),
+        source,
+    })?;
+    let (networks, _) = decode_model(&bytes, &path.display().to_string())?;
+    let settings = TrainSettings {
+        from_model: Some(vision::model_id(&bytes)),
+        ..settings.clone()
+    };
+    Ok((settings, networks))
+}
+
+/// A network to train: the one of that name to go on from, or a new one.
+fn trainer(start: &BTreeMap<String, Vec<u8>>, name: &str, stage: Stage, seed: u64) -> Result<Trainer, TrainError> {
+    match start.get(name) {
+        Some(bytes) => Ok(Trainer::from_bytes(bytes)?),
+        None => Ok(Trainer::new(
+            if stage == Stage::Fine {
+                fine_spec()
+            } else {
+                coarse_spec()
+            },
+            seed,
+        )),
+    }
+}
+
 fn network(
+    mut trainer: Trainer,
     stage: Stage,
     patches: &[Patch],
     settings: &TrainSettings,
@@ -274,14 +330,6 @@ fn network(
     seed: u64,
     say: &dyn Fn(usize, f32),
 ) -> (Trainer, f32) {
-    let mut trainer = Trainer::new(
-        if stage == Stage::Fine {
-            fine_spec()
-        } else {
-            coarse_spec()
-        },
-        seed,
-    );
     let mut pools: Vec<(f64, Vec<usize>)> = Pool::ALL
         .iter()
         .map(|&pool| {

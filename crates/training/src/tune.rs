@@ -9,8 +9,8 @@ use vision::{Corrections, Cue, Detector, Model, Options, Screw, Settings, Thresh
 const MISS: f64 = 1.0;
 /// Cost of something taken for a screw: the bit goes where it must not.
 const FALSE_FIND: f64 = 3.0;
-/// Cost of a look by a person.
-const LOOK: f64 = 0.2;
+/// Cost of a look by a person: unattended, the unit is excluded for it.
+const LOOK: f64 = 0.4;
 
 /// What was chosen, and by which figures.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]

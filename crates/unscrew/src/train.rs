@@ -21,6 +21,12 @@ pub struct Args {
     /// Folder of the real photographs
     #[arg(long, default_value = "crates/training/data", value_name = "DIR")]
     data: PathBuf,
+    /// Model to train further; left out, training starts anew
+    #[arg(long, value_name = "FILE")]
+    from: Option<PathBuf>,
+    /// Seed of the first unit to learn from
+    #[arg(long, default_value_t = 0)]
+    first_unit: u64,
     /// Units whose faces are rendered to learn from
     #[arg(long, default_value_t = TrainSettings::default().units)]
     units: u64,
@@ -72,6 +78,8 @@ pub fn run(args: &Args) -> Result<Ended> {
         output::prepare_folder(folder)?;
     }
     let settings = TrainSettings {
+        from: args.from.clone(),
+        first_unit: args.first_unit,
         units: args.units,
         coarse_steps: args.coarse_steps,
         fine_steps: args.fine_steps,
