@@ -254,7 +254,10 @@ pub fn read_camera_info(path: &Path) -> Result<CameraModel, FileError> {
         reason,
     };
     let text = String::from_utf8(bytes(path)?).map_err(|_| bad("it is not text".into()))?;
-    let info: CameraInfo = serde_saphyr::from_str(&text).map_err(|e| bad(e.to_string()))?;
+    let info: CameraInfo = serde_saphyr::from_str(&text).map_err(|e| {
+        // the first line says what and where; the rest is a picture of the file
+        bad(e.to_string().lines().next().unwrap_or_default().to_owned())
+    })?;
     if info.distortion_model != "plumb_bob" {
         return Err(bad(format!("distortion_model is {}", info.distortion_model)));
     }

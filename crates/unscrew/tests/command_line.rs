@@ -81,7 +81,7 @@ fn bad_companions_are_refused_by_name() {
     refused(
         at,
         &["detect", "a.png", "--model", "other.unscrew"],
-        &["other.unscrew", "version"],
+        &["other.unscrew", "format '9'"],
     );
     fs::write(at.join("map.json"), r#"{"format": "unscrew-map", "version": 99}"#).expect("written");
     let all = [
