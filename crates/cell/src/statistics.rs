@@ -4,47 +4,7 @@ use crate::record::{Outcome, Times, UnitRecord};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
-/// A share with its 95 % bounds.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Rate {
-    /// How many were.
-    pub hits: usize,
-    /// Of how many.
-    pub of: usize,
-    /// hits / of; `None` of nothing.
-    pub rate: Option<f64>,
-    /// Lower 95 % bound.
-    pub low: f64,
-    /// Upper 95 % bound.
-    pub high: f64,
-}
-
-impl Rate {
-    /// A share with its Wilson score bounds.
-    pub fn of(hits: usize, of: usize) -> Self {
-        let (low, high) = wilson(hits, of);
-        Self {
-            hits,
-            of,
-            rate: (of > 0).then(|| hits as f64 / of as f64),
-            low,
-            high,
-        }
-    }
-}
-
-/// 95 % bounds of a binomial share (Wilson 1927); (0, 1) of nothing.
-pub fn wilson(hits: usize, of: usize) -> (f64, f64) {
-    if of == 0 {
-        return (0.0, 1.0);
-    }
-    const Z: f64 = 1.959_963_984_540_054;
-    let (n, p) = (of as f64, hits as f64 / of as f64);
-    let centre = p + Z * Z / (2.0 * n);
-    let half = Z * (p * (1.0 - p) / n + Z * Z / (4.0 * n * n)).sqrt();
-    let scale = 1.0 + Z * Z / n;
-    (((centre - half) / scale).max(0.0), ((centre + half) / scale).min(1.0))
-}
+pub use geometry::{Rate, wilson};
 
 /// What a number of units says.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -159,16 +119,6 @@ fn word(reason: &impl Serialize) -> String {
 mod tests {
     use super::*;
     use crate::record::{ExclusionReason, NgReason};
-
-    #[test]
-    fn wilson_bounds_of_the_paper_s_figures() {
-        let percent = |(low, high): (f64, f64)| [(low * 1e4).round() / 100.0, (high * 1e4).round() / 100.0];
-        assert_eq!(percent(wilson(3064, 3070)), [99.57, 99.91]);
-        assert_eq!(percent(wilson(72, 92)), [68.79, 85.46]);
-        assert_eq!(wilson(0, 0), (0.0, 1.0));
-        let (low, high) = wilson(12, 12);
-        assert!(low > 0.7 && high == 1.0);
-    }
 
     #[test]
     fn excluded_units_count_in_one_rate_and_not_in_the_other() {

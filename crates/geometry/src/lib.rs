@@ -1,4 +1,4 @@
-//! Frames, points, transforms, the camera model, RGB-D frames and their files.
+//! Frames, points, transforms, the camera model, RGB-D frames and their files; rates with bounds.
 //!
 //! Everything else is built on this crate; it uses none of the others. A point knows its frame by type, a transform is
 //! named by both ends (`base_from_camera`), pixels of the whole image and of a clip are different types, and lengths are
@@ -19,6 +19,7 @@ mod camera;
 mod depth;
 mod files;
 mod frame;
+mod rate;
 mod rgbd;
 
 pub use camera::CameraModel;
@@ -28,6 +29,7 @@ pub use files::{
     write_jpeg, write_png,
 };
 pub use frame::{Base, Camera, Direction, Face, Flange, Frame, Pixel, Point, Table, Tool, Transform, Unit, space};
+pub use rate::{Rate, wilson, wilson_share};
 pub use rgbd::RgbdFrame;
 
 /// Re-exported so that users of the crate see the same version.

@@ -651,6 +651,14 @@ impl Trainer {
     /// # Errors
     /// [`NnError::Io`] where the file cannot be written.
     pub fn save_checkpoint(&self, path: impl AsRef<Path>, metadata: &BTreeMap<String, String>) -> Result<(), NnError> {
+        write(path.as_ref(), &self.checkpoint_bytes(metadata)?)
+    }
+
+    /// The bytes that [`save_checkpoint`](Self::save_checkpoint) writes: a second trainer made of them goes on alike.
+    ///
+    /// # Errors
+    /// [`NnError::Format`] where the metadata cannot be written as JSON.
+    pub fn checkpoint_bytes(&self, metadata: &BTreeMap<String, String>) -> Result<Vec<u8>, NnError> {
         let mut metadata = metadata.clone();
         metadata.insert(STEPS.into(), self.steps.to_string());
         let mut entries = self.entries();
@@ -666,7 +674,7 @@ impl Trainer {
                 }
             }
         }
-        write(path.as_ref(), &serialize(&self.spec, &metadata, &entries)?)
+        serialize(&self.spec, &metadata, &entries)
     }
 
     /// Reads a file that [`save_checkpoint`](Self::save_checkpoint) wrote; or one that [`save`](Self::save) wrote, to

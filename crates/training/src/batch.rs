@@ -1,6 +1,6 @@
 //! From patches to what the networks are fed: crop, turn, scale, light, and the targets of every cell.
 
-use crate::samples::{Classes, PATCH_PX, Patch, only};
+use crate::samples::{Classes, Label, PATCH_PX, Patch, only};
 use geometry::{Pixel, RgbImage};
 use nn::Tensor;
 use rand::{RngExt, SeedableRng};
@@ -14,6 +14,15 @@ use vision::layout::{
 
 /// Side of the coarse network's training crop, px.
 pub const COARSE_PX: usize = 96;
+
+/// Share of pictures with a cable, a pipe or a strip of sheet drawn across: the rendered ones rarely have it over a head.
+const OCCLUDED: f64 = 0.06;
+/// Share of pictures that get another camera's light, colour and noise in full; the others are nearly left as rendered.
+const RELIT: f64 = 0.5;
+
+/// Weight of each regression beside the classes' cross-entropy, and the error from which it counts linearly. Offsets
+/// that weigh more than this take the network's attention from telling a cross from a hexalobular recess.
+const PLACE_WEIGHTS: [(f32, f32); 3] = [(0.15, 0.06), (0.15, 0.06), (0.015, 0.1)];
 
 /// Which network a batch is for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -89,7 +98,7 @@ fn fill(stage: Stage, patch: &Patch, rng: &mut Pcg64Mcg, pixels: &mut [f32], tar
     };
     let mut source = focus.filter(|_| stage == Stage::Fine).unwrap_or([middle, middle]);
     source = source.map(|c| c + normal(jitter).clamp(-12.0, 12.0));
-    let scale = normal(0.12).exp().clamp(0.72, 1.4);
+    let scale = normal(0.10).exp().clamp(0.75, 1.4);
     let angle: f64 = normal(0.12);
     let flip = rng.random_bool(0.5);
     let turns = rng.random_range(0..4);
@@ -125,11 +134,18 @@ fn fill(stage: Stage, patch: &Patch, rng: &mut Pcg64Mcg, pixels: &mut [f32], tar
         [dx + half, dy + half]
     };
     let mut rgb = vec![0f32; side * side * 3];
+    let (corner, right, down) = (forward(0.0, 0.0), forward(1.0, 0.0), forward(0.0, 1.0));
+    let along =
+        |axis: usize, x: f64, y: f64| corner[axis] + x * (right[axis] - corner[axis]) + y * (down[axis] - corner[axis]);
     for y in 0..side {
         for x in 0..side {
-            let [u, v] = forward(x as f64, y as f64);
+            let [u, v] = [0, 1].map(|axis| along(axis, x as f64, y as f64));
             sample(&patch.rgb, u, v, &mut rgb[3 * (y * side + x)..][..3]);
         }
+    }
+    let strand = rng.random_bool(OCCLUDED).then(|| Strand::sample(half, scale, rng));
+    if let Some(strand) = &strand {
+        strand.draw(&mut rgb, side);
     }
     relight(&mut rgb, side, rng);
     let bytes: Vec<u8> = rgb.iter().map(|v| v.round().clamp(0.0, 255.0) as u8).collect();
@@ -150,18 +166,19 @@ fn fill(stage: Stage, patch: &Patch, rng: &mut Pcg64Mcg, pixels: &mut [f32], tar
         .labels
         .iter()
         .map(|l| {
-            (
+            let (at, d) = (
                 backward(f64::from(l.u_px), f64::from(l.v_px)),
                 f64::from(l.diameter_px) * scale,
-                l,
-            )
+            );
+            let hidden = strand.as_ref().is_some_and(|s| s.hides(at, d));
+            (at, d, if hidden { Label { classes: 0, ..*l } } else { *l })
         })
         .collect();
     for (k, target) in targets.iter_mut().enumerate() {
         let (x, y) = (cell_center_px(k % cells), cell_center_px(k / cells));
         let nearest = labels
             .iter()
-            .map(|(at, d, label)| ((x - at[0]).hypot(y - at[1]) / d, at, *d, *label))
+            .map(|(at, d, label)| ((x - at[0]).hypot(y - at[1]) / d, at, *d, label))
             .min_by(|a, b| a.0.total_cmp(&b.0));
         *target = match nearest {
             Some((r, at, d, label)) if r < LABEL_RADIUS => Target {
@@ -178,7 +195,7 @@ fn fill(stage: Stage, patch: &Patch, rng: &mut Pcg64Mcg, pixels: &mut [f32], tar
             Some((r, _, _, label)) if r < IGNORE_RADIUS || (label.classes == 0 && r < 0.8) => Target::default(),
             _ => Target {
                 classes: patch.elsewhere,
-                weight: if stage == Stage::Fine { 0.12 } else { 0.3 },
+                weight: if stage == Stage::Fine { 0.03 } else { 0.3 },
                 regression: None,
             },
         };
@@ -223,19 +240,86 @@ fn sample(rgb: &[u8], u: f64, v: f64, out: &mut [f32]) {
     }
 }
 
+/// Something long in front of an item: a cable, a pipe, a strip of sheet, with its shadow.
+struct Strand {
+    /// Unit normal of its axis.
+    normal: [f64; 2],
+    /// Distance of its axis from the crop's first pixel along the normal, px.
+    at_px: f64,
+    half_width_px: f64,
+    color: [f32; 3],
+    /// 1: round as a cable; 0: flat.
+    round: f32,
+    /// Where along its width the light falls, -1 to 1.
+    light: f32,
+    shadow_px: f64,
+}
+
+impl Strand {
+    /// One that passes near the crop pixel (`middle`, `middle`).
+    fn sample(middle: f64, scale: f64, rng: &mut Pcg64Mcg) -> Self {
+        let angle = rng.random_range(0.0..std::f64::consts::TAU);
+        let normal = [angle.cos(), angle.sin()];
+        let half_width_px = rng.random_range(2.0..8.0) * scale;
+        let base = rng.random_range(15.0..235.0f32);
+        let spread = if rng.random_bool(0.5) { 12.0 } else { 90.0 };
+        Self {
+            normal,
+            at_px: middle * (normal[0] + normal[1]) + rng.random_range(4.0..18.0) * scale,
+            half_width_px,
+            color: std::array::from_fn(|_| (base + rng.random_range(-spread..spread)).clamp(5.0, 250.0)),
+            round: if rng.random_bool(0.75) {
+                rng.random_range(0.4..1.0)
+            } else {
+                0.0
+            },
+            light: rng.random_range(-0.8..0.8),
+            shadow_px: rng.random_range(-6.0..6.0),
+        }
+    }
+
+    /// Distance from its axis, px.
+    fn off(&self, at: [f64; 2]) -> f64 {
+        at[0] * self.normal[0] + at[1] * self.normal[1] - self.at_px
+    }
+
+    fn draw(&self, rgb: &mut [f32], side: usize) {
+        for (k, pixel) in rgb.chunks_exact_mut(3).enumerate() {
+            let off = self.off([(k % side) as f64, (k / side) as f64]);
+            let cover = |off: f64| (self.half_width_px - off.abs() + 0.5).clamp(0.0, 1.0) as f32;
+            let dark = 1.0 - 0.45 * cover(off - self.shadow_px);
+            let across = (off / self.half_width_px).clamp(-1.0, 1.0) as f32;
+            let shade = 1.0 - self.round * (0.75 * (across - self.light).powi(2)).min(0.9);
+            let cover = cover(off);
+            for (value, color) in pixel.iter_mut().zip(self.color) {
+                *value = *value * dark * (1.0 - cover) + color * shade * cover;
+            }
+        }
+    }
+
+    /// True if less than half of the head or 40 % of its slot is left to see: then nothing is to be learned from it.
+    fn hides(&self, at: [f64; 2], diameter_px: f64) -> bool {
+        let (low, high) = (self.off(at) - self.half_width_px, self.off(at) + self.half_width_px);
+        let hidden = |radius: f64| ((high.min(radius) - low.max(-radius)) / (2.0 * radius)).max(0.0);
+        hidden(0.5 * diameter_px) > 0.45 || hidden(0.21 * diameter_px) > 0.55
+    }
+}
+
 /// Light, colour, contrast, blur and noise as another camera would have them.
 fn relight(rgb: &mut [f32], side: usize, rng: &mut Pcg64Mcg) {
-    let gain = rng.random_range(0.7..1.35f32);
-    let gamma = rng.random_range(0.7..1.4f32);
-    let cast: [f32; 3] = std::array::from_fn(|_| rng.random_range(0.85..1.18f32));
-    let gray = if rng.random_bool(0.12) {
+    let full = rng.random_bool(RELIT);
+    let much = if full { 1.0f32 } else { 0.25 };
+    let gain = (much * rng.random_range(-0.35..0.30f32)).exp();
+    let gamma = (much * rng.random_range(-0.35..0.33f32)).exp();
+    let cast: [f32; 3] = std::array::from_fn(|_| 1.0 + much * rng.random_range(-0.15..0.18f32));
+    let gray = if full && rng.random_bool(0.2) {
         1.0
     } else {
-        rng.random_range(0.0..0.3f32)
+        much * rng.random_range(0.0..0.3f32)
     };
-    let invert_order = rng.random_bool(0.06); // red and blue exchanged: rust must not be all there is to see
+    let invert_order = full && rng.random_bool(0.12); // red and blue exchanged: rust must not be all there is to see
     let slope = [rng.random_range(-0.25..0.25f32), rng.random_range(-0.25..0.25f32)];
-    let noise = if rng.random_bool(0.5) {
+    let noise = if full && rng.random_bool(0.7) {
         rng.random_range(0.0..7.0f32)
     } else {
         0.0
@@ -258,9 +342,9 @@ fn relight(rgb: &mut [f32], side: usize, rng: &mut Pcg64Mcg) {
             pixel.swap(0, 2);
         }
     }
-    if rng.random_bool(0.35) {
+    if full && rng.random_bool(0.35) {
         soften(rgb, side, rng.random_range(0.1..0.9f32));
-    } else if rng.random_bool(0.25) {
+    } else if full && rng.random_bool(0.25) {
         soften(rgb, side, -rng.random_range(0.1..0.5f32));
     }
     if noise > 0.0 {
@@ -348,7 +432,7 @@ pub fn loss(stage: Stage, output: &Tensor, targets: &[Target], grad: &mut Tensor
         if let Some(truth) = target.regression {
             for (channel, (truth, (weight, knee))) in [OFFSET_U, OFFSET_V, LN_DIAMETER]
                 .into_iter()
-                .zip(truth.into_iter().zip([(6.0, 0.06), (6.0, 0.06), (0.6, 0.1)]))
+                .zip(truth.into_iter().zip(PLACE_WEIGHTS))
             {
                 let error = z[channel] - truth;
                 let w = weight / known;

@@ -6,6 +6,7 @@
 
 mod batch;
 mod evaluate;
+mod face;
 mod real;
 mod samples;
 mod train;
@@ -13,8 +14,11 @@ mod tune;
 
 pub use evaluate::{
     Coverage, CropEvaluation, DecoyRow, DriveRow, EvaluateError, Evaluation, Evaluator, FIRST_EVALUATION_SEED,
-    FalseFind, Miss, PhotoEvaluation, Product, Quantiles, Rate, SceneRow, StageOne, evaluate_crops, evaluate_faces,
-    evaluate_truth_folder, evaluate_yolo_folder, truth_files, wilson,
+    FalseFind, Miss, PhotoEvaluation, Product, Quantiles, SceneRow, StageOne, evaluate_crops, evaluate_faces,
+    evaluate_truth_folder, evaluate_yolo_folder, truth_files,
 };
-pub use train::{Progress, TRAINING_SEEDS, TUNING_SEEDS, TrainError, TrainReport, TrainSettings, train};
+pub use geometry::{Rate, wilson};
+pub use train::{
+    Progress, TRAINING_SEEDS, TUNING_SEEDS, TrainError, TrainReport, TrainSettings, Trial, train, try_network,
+};
 pub use tune::Tuning;

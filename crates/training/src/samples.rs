@@ -1,10 +1,13 @@
 //! Patches to learn from: cut out of rendered faces, with a label for every item in them.
 
+use crate::TrainError;
 use geometry::{Pixel, RgbImage};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use rayon::prelude::*;
 use scene::{FaceId, FaceTruth, FaceView, Prepared, Roi, Unit, UnitOptions};
+use serde::{Deserialize, Serialize};
+use std::path::Path;
 use std::sync::atomic::{AtomicU64, Ordering};
 use vision::layout::Class;
 
@@ -25,7 +28,7 @@ pub fn any_fastener() -> Classes {
 }
 
 /// An item in a patch.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Label {
     /// Centre in the patch, px.
     pub u_px: f32,
@@ -40,7 +43,7 @@ pub struct Label {
 }
 
 /// A patch of [`PATCH_PX`]² pixels with everything that is in it.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Patch {
     /// RGB, row by row.
     pub rgb: Vec<u8>,
@@ -144,51 +147,102 @@ pub fn views(seed: u64) -> Vec<FaceView> {
 }
 
 /// Patches of units `seeds`: every item of every face, and `background` places a face where nothing was put.
-pub fn rendered(seeds: std::ops::Range<u64>, background: usize, done: &(dyn Fn(u64) + Sync)) -> Vec<Patch> {
+///
+/// With a `work` folder, each unit's patches are kept there, and taken from there where they are already.
+///
+/// # Errors
+/// [`TrainError`] if a file of the work folder cannot be read or written, or if another renderer made it.
+pub fn rendered(
+    seeds: std::ops::Range<u64>,
+    background: usize,
+    work: Option<&Path>,
+    done: &(dyn Fn(u64) + Sync),
+) -> Result<Vec<Patch>, TrainError> {
     let count = AtomicU64::new(0);
+    let file = |folder: &Path, seed: u64| folder.join(format!("unit-{seed:06}-{background}.patches"));
+    if let Some((folder, first)) = work.zip(seeds.clone().next())
+        && let Some(kept) = read(&file(folder, first))?
+        && kept != unit(first, background)
+    {
+        return Err(TrainError::OtherRenderer { folder: folder.into() });
+    }
     let per_unit: Vec<Vec<Patch>> = seeds
         .into_par_iter()
         .map(|seed| {
-            let mut rng = Pcg64Mcg::seed_from_u64(seed ^ 0x9A7C);
-            let mut patches = Vec::new();
-            for mut view in views(seed) {
-                // some screws are out already: what they leave must not be taken for one
-                let out: Vec<_> = view
-                    .design
-                    .screws
-                    .iter()
-                    .map(|s| s.id)
-                    .filter(|_| rng.random_bool(0.06))
-                    .collect();
-                view.removed_screws = out;
-                let prepared = Prepared::new(&view);
-                let truth = prepared.truth();
-                let all = labels(&truth);
-                for (p, _, classes) in &all {
-                    if *classes != 0 {
-                        let jitter = |rng: &mut Pcg64Mcg| rng.random_range(-12.0..12.0);
-                        let center = Pixel::new(p.u_px + jitter(&mut rng), p.v_px + jitter(&mut rng));
-                        patches.push(cut(&prepared, &all, center, true));
-                    }
+            let kept = work.map(|folder| read(&file(folder, seed))).transpose()?.flatten();
+            let patches = match (kept, work) {
+                (Some(kept), _) => kept,
+                (None, None) => unit(seed, background),
+                (None, Some(folder)) => {
+                    let patches = unit(seed, background);
+                    write(&file(folder, seed), &patches)?;
+                    patches
                 }
-                let (w, h) = (f64::from(view.camera.width_px), f64::from(view.camera.height_px));
-                for _ in 0..background {
-                    // mostly on the unit
-                    let center = if rng.random_bool(0.8) {
-                        let at = |rng: &mut Pcg64Mcg, size: f64| rng.random_range(-0.52..0.52) * size;
-                        let (x, y) = (at(&mut rng, view.design.width_mm), at(&mut rng, view.design.height_mm));
-                        view.camera
-                            .project(view.camera_point(x, y, 0.0))
-                            .unwrap_or(Pixel::new(w / 2.0, h / 2.0))
-                    } else {
-                        Pixel::new(rng.random_range(0.0..w), rng.random_range(0.0..h))
-                    };
-                    patches.push(cut(&prepared, &all, center, false));
-                }
-            }
+            };
             done(count.fetch_add(1, Ordering::Relaxed) + 1);
-            patches
+            Ok(patches)
         })
-        .collect();
-    per_unit.into_iter().flatten().collect()
+        .collect::<Result<_, TrainError>>()?;
+    Ok(per_unit.into_iter().flatten().collect())
+}
+
+/// Patches of one unit.
+fn unit(seed: u64, background: usize) -> Vec<Patch> {
+    let mut rng = Pcg64Mcg::seed_from_u64(seed ^ 0x9A7C);
+    let mut patches = Vec::new();
+    for mut view in views(seed) {
+        // some screws are out already: what they leave must not be taken for one
+        let out: Vec<_> = view
+            .design
+            .screws
+            .iter()
+            .map(|s| s.id)
+            .filter(|_| rng.random_bool(0.06))
+            .collect();
+        view.removed_screws = out;
+        let prepared = Prepared::new(&view);
+        let truth = prepared.truth();
+        let all = labels(&truth);
+        for (p, _, classes) in &all {
+            if *classes != 0 {
+                let jitter = |rng: &mut Pcg64Mcg| rng.random_range(-12.0..12.0);
+                let center = Pixel::new(p.u_px + jitter(&mut rng), p.v_px + jitter(&mut rng));
+                patches.push(cut(&prepared, &all, center, true));
+            }
+        }
+        let (w, h) = (f64::from(view.camera.width_px), f64::from(view.camera.height_px));
+        for _ in 0..background {
+            // mostly on the unit
+            let center = if rng.random_bool(0.8) {
+                let at = |rng: &mut Pcg64Mcg, size: f64| rng.random_range(-0.52..0.52) * size;
+                let (x, y) = (at(&mut rng, view.design.width_mm), at(&mut rng, view.design.height_mm));
+                view.camera
+                    .project(view.camera_point(x, y, 0.0))
+                    .unwrap_or(Pixel::new(w / 2.0, h / 2.0))
+            } else {
+                Pixel::new(rng.random_range(0.0..w), rng.random_range(0.0..h))
+            };
+            patches.push(cut(&prepared, &all, center, false));
+        }
+    }
+    patches
+}
+
+/// Patches of a file; `None` where there is none.
+fn read(path: &Path) -> Result<Option<Vec<Patch>>, TrainError> {
+    match std::fs::read(path) {
+        Ok(bytes) => postcard::from_bytes(&bytes)
+            .map(Some)
+            .map_err(|_| TrainError::Damaged { path: path.into() }),
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(None),
+        Err(source) => Err(TrainError::Data {
+            path: path.into(),
+            source,
+        }),
+    }
+}
+
+fn write(path: &Path, patches: &[Patch]) -> Result<(), TrainError> {
+    let bytes = postcard::to_allocvec(patches).map_err(|_| TrainError::Damaged { path: path.into() })?;
+    Ok(geometry::write_aside(path, &bytes)?)
 }

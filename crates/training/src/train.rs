@@ -2,17 +2,20 @@
 
 use crate::batch::{Batch, Stage, batch, loss};
 use crate::real;
-use crate::samples::{Patch, any_fastener, only, rendered};
+use crate::samples::{PATCH_PX, Patch, any_fastener, only, rendered};
 use crate::tune::{self, Tuning};
-use nn::{Tensor, Trainer};
+use geometry::{Pixel, RgbImage};
+use nn::{Spec, Tensor, Trainer};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use serde::Serialize;
 use serde_json::json;
+use sha2::{Digest, Sha256};
 use std::{
     collections::BTreeMap,
     ops::Range,
     path::{Path, PathBuf},
+    time::Instant,
 };
 use vision::layout::{Class, coarse_spec, fine_spec};
 use vision::{Detector, Settings, Thresholds, decode_model, encode_model};
@@ -25,6 +28,8 @@ pub const TRAINING_SEEDS: Range<u64> = 0..500_000;
 pub const TUNING_SEEDS: Range<u64> = 500_000..1_000_000;
 /// Steps over which the learning rate rises to its full value: batch norm has no statistics to stand on before.
 const WARM_UP: usize = 100;
+/// Steps after which a network is written to the work folder.
+const KEEP_EVERY: usize = 500;
 
 /// Why training could not be done.
 #[derive(Debug, thiserror::Error)]
@@ -36,6 +41,18 @@ pub enum TrainError {
         path: PathBuf,
         /// The system's reason.
         source: std::io::Error,
+    },
+    /// A file of the work folder is not what training wrote.
+    #[error("{path} is damaged; delete it, and training makes it anew")]
+    Damaged {
+        /// The file.
+        path: PathBuf,
+    },
+    /// The work folder is from before a change of the renderer.
+    #[error("the patches kept in {folder} were rendered by another version; give another --work folder")]
+    OtherRenderer {
+        /// The folder.
+        folder: PathBuf,
     },
     /// A picture or the model file.
     #[error(transparent)]
@@ -71,8 +88,10 @@ pub struct TrainSettings {
     pub decay: f32,
     /// Steps of stage 1.
     pub coarse_steps: usize,
-    /// Steps of each network of stage 2.
+    /// Steps of each network of stage 2, those that they share included.
     pub fine_steps: usize,
+    /// The first steps, which the networks of stage 2 share.
+    pub shared_steps: usize,
     /// Faces that set thresholds and sigma factors.
     pub tuning_faces: u64,
     /// Seed of everything.
@@ -82,6 +101,9 @@ pub struct TrainSettings {
     pub from: Option<PathBuf>,
     /// Identity of that model.
     pub from_model: Option<String>,
+    /// Folder where rendered patches and half-trained networks are kept, so that a stopped training goes on; `None` keeps nothing.
+    #[serde(skip)]
+    pub work: Option<PathBuf>,
     /// Folder of the real photographs.
     #[serde(skip)]
     pub data: PathBuf,
@@ -93,17 +115,19 @@ impl Default for TrainSettings {
     fn default() -> Self {
         Self {
             first_unit: 0,
-            units: 150,
+            units: 500,
             background: 8,
             batch: 128,
             learning_rate: 0.01,
             decay: 0.25,
             coarse_steps: 1900,
-            fine_steps: 2500,
-            tuning_faces: 24,
+            fine_steps: 8000,
+            shared_steps: 5000,
+            tuning_faces: 40,
             seed: 1,
             from: None,
             from_model: None,
+            work: None,
             data: PathBuf::from("crates/training/data"),
             date: String::new(),
         }
@@ -144,39 +168,55 @@ pub fn train(settings: &TrainSettings, out: &Path, progress: &dyn Progress) -> R
     let mut patches = rendered(
         settings.first_unit..settings.first_unit + settings.units,
         settings.background,
+        settings.work.as_deref(),
         &|done| {
             progress.report("rendering", done, settings.units, None);
         },
-    );
+    )?;
     let counted = count(&patches, &real);
     patches.extend(real);
-    let mut losses = BTreeMap::new();
-    let mut learn = |name: String, stage, steps, seed| {
-        let (trainer, loss) = network(
-            trainer(start, &name, stage, seed)?,
-            stage,
-            &patches,
-            settings,
-            steps,
-            seed,
-            &|done, loss| {
-                progress.report(&name, done as u64, steps as u64, Some(loss));
-            },
-        );
-        losses.insert(name, loss);
-        Ok::<_, TrainError>(trainer.to_bytes(&BTreeMap::new())?)
+    let lesson = Lesson {
+        settings,
+        patches: &patches,
+        progress,
     };
-    let coarse = learn("coarse".to_owned(), Stage::Coarse, settings.coarse_steps, settings.seed)?;
-    let fine: Vec<Vec<u8>> = (0..ENSEMBLE)
-        .map(|k| {
-            learn(
-                format!("fine{k}"),
-                Stage::Fine,
-                settings.fine_steps,
-                settings.seed + 1 + k,
-            )
-        })
-        .collect::<Result<_, _>>()?;
+    let mut losses = BTreeMap::new();
+    let begun = |name: &str, spec: Spec, seed| match start.get(name) {
+        Some(bytes) => Trainer::from_bytes(bytes),
+        None => Ok(Trainer::new(spec, seed)),
+    };
+    let coarse = lesson.learn(
+        "coarse",
+        begun("coarse", coarse_spec(), settings.seed)?,
+        Stage::Coarse,
+        settings.coarse_steps..settings.coarse_steps,
+        &mut losses,
+    )?;
+    // the members of the ensemble share their first steps, then each goes its own way
+    let shared = if settings.from.is_some() {
+        0
+    } else {
+        settings.shared_steps
+    };
+    let trunk = lesson.learn(
+        "shared",
+        Trainer::new(fine_spec(), settings.seed + 1),
+        Stage::Fine,
+        shared..settings.fine_steps,
+        &mut losses,
+    )?;
+    let mut fine = Vec::new();
+    for k in 0..ENSEMBLE {
+        let name = format!("fine{k}");
+        let trainer = match start.get(&name) {
+            Some(bytes) => Trainer::from_bytes(bytes)?,
+            None => trunk.clone(),
+        };
+        let steps = settings.fine_steps..settings.fine_steps;
+        let trainer = lesson.learn(&name, trainer, Stage::Fine, steps, &mut losses)?;
+        fine.push(trainer.to_bytes(&BTreeMap::new())?);
+    }
+    let coarse = coarse.to_bytes(&BTreeMap::new())?;
     drop(patches);
     let untuned = Settings {
         thresholds: Thresholds::default(),
@@ -263,11 +303,11 @@ impl Pool {
     /// Share of a batch: whole pictures are mostly background, candidates mostly are not.
     fn share(self, stage: Stage) -> f64 {
         let [coarse, fine] = match self {
-            Pool::Cross => [0.34, 0.38],
-            Pool::OtherDrive => [0.10, 0.15],
-            Pool::OtherFeature => [0.18, 0.26],
-            Pool::Background => [0.26, 0.09],
-            Pool::Real => [0.12, 0.12],
+            Pool::Cross => [0.34, 0.36],
+            Pool::OtherDrive => [0.10, 0.20],
+            Pool::OtherFeature => [0.18, 0.22],
+            Pool::Background => [0.26, 0.08],
+            Pool::Real => [0.12, 0.14],
         };
         if stage == Stage::Coarse { coarse } else { fine }
     }
@@ -306,30 +346,98 @@ fn begun(settings: &TrainSettings) -> Result<(TrainSettings, BTreeMap<String, Ve
     Ok((settings, networks))
 }
 
-/// A network to train: the one of that name to go on from, or a new one.
-fn trainer(start: &BTreeMap<String, Vec<u8>>, name: &str, stage: Stage, seed: u64) -> Result<Trainer, TrainError> {
-    match start.get(name) {
-        Some(bytes) => Ok(Trainer::from_bytes(bytes)?),
-        None => Ok(Trainer::new(
-            if stage == Stage::Fine {
-                fine_spec()
+/// What every network of a training learns from, and how.
+struct Lesson<'a> {
+    settings: &'a TrainSettings,
+    patches: &'a [Patch],
+    progress: &'a dyn Progress,
+}
+
+impl Lesson<'_> {
+    /// Trains from the step where the trainer is up to `steps.start`, at the learning rates of a training of `steps.end` steps.
+    fn learn(
+        &self,
+        name: &str,
+        mut trainer: Trainer,
+        stage: Stage,
+        steps: Range<usize>,
+        losses: &mut BTreeMap<String, f32>,
+    ) -> Result<Trainer, TrainError> {
+        let settings = self.settings;
+        let (last, total) = (steps.start, steps.end);
+        let kept = settings.work.as_ref().map(|folder| {
+            let key = json!([settings_key(settings), trainer.spec(), name]).to_string();
+            folder.join(format!("{name}-{}.checkpoint", &hex(&Sha256::digest(key))[..12]))
+        });
+        if let Some(path) = kept.as_ref().filter(|p| p.exists()) {
+            trainer = Trainer::load_checkpoint(path)?;
+        }
+        let pools = pools(self.patches, stage);
+        let mut grad = Tensor::default();
+        let mut mean_loss = f32::NAN;
+        for step in trainer.steps() as usize..last {
+            // a generator a step: a training that goes on draws what it would have drawn
+            let mut rng = Pcg64Mcg::seed_from_u64(hash(&[settings.seed, name_hash(name), step as u64]));
+            let picks = picks(&pools, settings.batch, &mut rng);
+            let Batch { input, targets } = batch(stage, self.patches, &picks, rng.random());
+            let output = trainer.forward(&input);
+            let now = loss(stage, &output, &targets, &mut grad);
+            trainer.backward(&grad);
+            let rise = ((step + 1) as f32 / WARM_UP as f32).min(1.0);
+            let rate = settings.learning_rate * settings.decay.powi((3 * step / total) as i32) * rise;
+            trainer.adam_step(rate, 0.0);
+            mean_loss = if mean_loss.is_nan() {
+                now
             } else {
-                coarse_spec()
-            },
-            seed,
-        )),
+                0.98 * mean_loss + 0.02 * now
+            };
+            if (step + 1) % 50 == 0 || step + 1 == last {
+                self.progress
+                    .report(name, step as u64 + 1, last as u64, Some(mean_loss));
+            }
+            if let Some(path) = kept
+                .as_ref()
+                .filter(|_| (step + 1) % KEEP_EVERY == 0 || step + 1 == last)
+            {
+                geometry::write_aside(path, &trainer.checkpoint_bytes(&BTreeMap::new())?)?;
+            }
+        }
+        if !mean_loss.is_nan() {
+            losses.insert(name.to_owned(), mean_loss);
+        }
+        Ok(trainer)
     }
 }
 
-fn network(
-    mut trainer: Trainer,
-    stage: Stage,
-    patches: &[Patch],
-    settings: &TrainSettings,
-    steps: usize,
-    seed: u64,
-    say: &dyn Fn(usize, f32),
-) -> (Trainer, f32) {
+/// The settings that decide what a network learns, without those that only say where or when.
+fn settings_key(settings: &TrainSettings) -> serde_json::Value {
+    json!(TrainSettings {
+        date: String::new(),
+        tuning_faces: 0,
+        ..settings.clone()
+    })
+}
+
+fn hex(bytes: &[u8]) -> String {
+    bytes.iter().map(|b| format!("{b:02x}")).collect()
+}
+
+/// A number that depends on all of `parts` (FNV-1a).
+fn hash(parts: &[u64]) -> u64 {
+    parts
+        .iter()
+        .flat_map(|p| p.to_le_bytes())
+        .fold(0xCBF2_9CE4_8422_2325, |h, b| {
+            (h ^ u64::from(b)).wrapping_mul(0x0100_0000_01B3)
+        })
+}
+
+fn name_hash(name: &str) -> u64 {
+    hash(&name.bytes().map(u64::from).collect::<Vec<_>>())
+}
+
+/// Patches by pool, with each pool's share of a batch.
+fn pools(patches: &[Patch], stage: Stage) -> Vec<(f64, Vec<usize>)> {
     let mut pools: Vec<(f64, Vec<usize>)> = Pool::ALL
         .iter()
         .map(|&pool| {
@@ -338,25 +446,118 @@ fn network(
         })
         .collect();
     pools.retain(|p| !p.1.is_empty());
-    let mut rng = Pcg64Mcg::seed_from_u64(seed);
-    let mut grad = Tensor::default();
-    let mut mean_loss = 0.0f32;
-    for step in 0..steps {
-        let picks = picks(&pools, settings.batch, &mut rng);
-        let Batch { input, targets } = batch(stage, patches, &picks, rng.random());
-        let output = trainer.forward(&input);
-        let now = loss(stage, &output, &targets, &mut grad);
-        trainer.backward(&grad);
-        let rise = ((step + 1) as f32 / WARM_UP as f32).min(1.0);
-        trainer.adam_step(
-            settings.learning_rate * settings.decay.powi((3 * step / steps) as i32) * rise,
-            0.0,
-        );
-        let memory = 0.98f32.min(step as f32 / (step as f32 + 1.0));
-        mean_loss = memory * mean_loss + (1.0 - memory) * now;
-        if (step + 1) % 50 == 0 || step + 1 == steps {
-            say(step + 1, mean_loss);
+    pools
+}
+
+/// How one architecture of stage 2 does, alone, on patches of units that it did not learn from.
+#[derive(Clone, Debug, Serialize)]
+pub struct Trial {
+    /// Loss over the last steps of training.
+    pub loss: f32,
+    /// Time to train, s.
+    pub train_s: f64,
+    /// Patches of cross screws.
+    pub screws: usize,
+    /// Patches of other things and of background.
+    pub others: usize,
+    /// Share of the screws with a score above that of all but 3 in 1000 of the others.
+    pub recall: f64,
+    /// Mean of -ln of the probability of what is there: cross screw or not.
+    pub log_loss: f64,
+    /// Share of other fasteners whose drive is the likeliest of all.
+    pub drive_right: f64,
+    /// Median and 95th percentile of the centre's error on screws, px.
+    pub center_px: [f64; 2],
+}
+
+/// Trains one network of stage 2 on the rendered patches of `settings` and measures it on those of `units` units of the tuning seeds.
+///
+/// # Errors
+/// As [`train`].
+pub fn try_network(
+    spec: Spec,
+    settings: &TrainSettings,
+    units: u64,
+    progress: &dyn Progress,
+) -> Result<Trial, TrainError> {
+    let work = settings.work.as_deref();
+    let seeds = settings.first_unit..settings.first_unit + settings.units;
+    let mut patches = rendered(seeds, settings.background, work, &|_| {})?;
+    patches.extend(real::patches(&settings.data, settings.seed)?);
+    let lesson = Lesson {
+        settings: &TrainSettings {
+            work: None,
+            ..settings.clone()
+        },
+        patches: &patches,
+        progress,
+    };
+    let begin = Instant::now();
+    let mut losses = BTreeMap::new();
+    let steps = settings.fine_steps..settings.fine_steps;
+    let trainer = lesson.learn(
+        "trial",
+        Trainer::new(spec, settings.seed),
+        Stage::Fine,
+        steps,
+        &mut losses,
+    )?;
+    let train_s = begin.elapsed().as_secs_f64();
+    let networks = [trainer.network()];
+    let first = TUNING_SEEDS.start + 100_000;
+    let unseen = rendered(first..first + units, settings.background, work, &|_| {})?;
+    let (mut screws, mut others, mut errors) = (Vec::new(), Vec::new(), Vec::new());
+    let (mut drives, mut right) = (0, 0);
+    for patch in &unseen {
+        let Some(picture) = RgbImage::from_raw(PATCH_PX as u32, PATCH_PX as u32, patch.rgb.clone()) else {
+            continue;
+        };
+        let label = patch.labels.first().filter(|_| patch.focused);
+        let middle = PATCH_PX as f64 / 2.0;
+        // stage 1 is off by a few pixels
+        let place = label.map_or([middle; 2], |l| [f64::from(l.u_px) + 2.0, f64::from(l.v_px) - 2.0]);
+        let Some(found) = vision::look(&networks, &picture, &[Pixel::new(place[0], place[1])]).pop() else {
+            continue;
+        };
+        let score = f64::from(found.of(Class::Cross));
+        match label {
+            Some(l) if l.classes == only(Class::Cross) => {
+                screws.push(score);
+                errors.push((found.center.u_px - f64::from(l.u_px)).hypot(found.center.v_px - f64::from(l.v_px)));
+            }
+            Some(l) => {
+                others.push(score);
+                let drive = Class::ALL
+                    .into_iter()
+                    .find(|&c| c.is_fastener() && only(c) == l.classes);
+                let likeliest = Class::ALL
+                    .into_iter()
+                    .max_by(|a, b| found.of(*a).total_cmp(&found.of(*b)));
+                drives += usize::from(drive.is_some());
+                right += usize::from(drive.is_some() && drive == likeliest);
+            }
+            None if patch.labels.is_empty() => others.push(score),
+            None => {}
         }
     }
-    (trainer, mean_loss)
+    let sorted = |mut v: Vec<f64>| {
+        v.sort_by(f64::total_cmp);
+        v
+    };
+    let (screws, others, errors) = (sorted(screws), sorted(others), sorted(errors));
+    let at = |v: &[f64], share: f64| v.get((share * v.len() as f64) as usize).copied().unwrap_or(f64::NAN);
+    let limit = at(&others, 0.997);
+    let part = |hits: usize, of: usize| hits as f64 / of.max(1) as f64;
+    let sure = |p: &f64| -p.max(1e-6).ln();
+    let log_loss = screws.iter().map(sure).sum::<f64>() + others.iter().map(|p| sure(&(1.0 - p))).sum::<f64>();
+    Ok(Trial {
+        loss: losses.get("trial").copied().unwrap_or(f32::NAN),
+        train_s,
+        screws: screws.len(),
+        others: others.len(),
+        recall: part(screws.iter().filter(|s| **s > limit).count(), screws.len()),
+        log_loss: log_loss / (screws.len() + others.len()).max(1) as f64,
+        drive_right: part(right, drives),
+        center_px: [at(&errors, 0.5), at(&errors, 0.95)],
+    })
 }

@@ -1,10 +1,19 @@
 //! After training: thresholds from costs, sigma factors from errors, on faces that no network has learned from.
 
-use geometry::{Pixel, RgbdFrame};
-use scene::{FaceId, FaceTruth, FaceView, Prepared, Unit};
+use crate::face::{Shot, face_of, shot};
+use geometry::Pixel;
+use scene::Unit;
 use serde::{Deserialize, Serialize};
-use vision::{Corrections, Cue, Detector, Model, Options, Screw, Settings, Thresholds, Verdict, cross, outer_circle};
+use vision::layout::Class;
+use vision::{
+    Corrections, Detector, Evidence, Model, Options, Screw, Settings, Thresholds, Verdict, candidates, coarse_map,
+    cross, locate, look, outer_circle,
+};
 
+/// Share of a normal distribution within one sigma.
+const ONE_SIGMA: f64 = 0.6827;
+/// Errors below which a factor is not measured.
+const ENOUGH: usize = 20;
 /// Cost of a screw that is not found, in units of one miss.
 const MISS: f64 = 1.0;
 /// Cost of something taken for a screw: the bit goes where it must not.
@@ -17,7 +26,7 @@ const LOOK: f64 = 0.4;
 pub struct Tuning {
     /// Limits between the verdicts.
     pub thresholds: Thresholds,
-    /// Sigma factors.
+    /// Sigma factors and the scores' calibration.
     pub corrections: Corrections,
     /// Faces.
     pub faces: u64,
@@ -29,76 +38,55 @@ pub struct Tuning {
     pub cost_a_face: f64,
 }
 
-/// A face with what is on it.
-struct Shot {
-    frame: RgbdFrame,
-    truth: FaceTruth,
-}
-
-/// The face that a seed stands for, rendered: also what evaluation uses.
-fn shot(seed: u64) -> Option<Shot> {
-    let unit = Unit::sample(seed);
-    let view = FaceView::sample(&unit, FaceId::ALL[(seed % 5) as usize], seed)?;
-    let prepared = Prepared::new(&view);
-    let truth = prepared.truth();
-    let picture = prepared.render(None);
-    let frame = RgbdFrame {
-        color: picture.color,
-        depth: Some(picture.depth),
-        camera: Some(view.camera),
-        t_s: 0.0,
-    };
-    Some(Shot { frame, truth })
-}
-
-/// Chooses thresholds and sigma factors on `faces` rendered faces from `first_seed` on.
+/// Chooses thresholds, sigma factors and the scores' calibration on `faces` rendered faces from `first_seed` on.
 pub fn tune(model: &Model, first_seed: u64, faces: u64, done: &dyn Fn(u64)) -> Tuning {
-    let shots: Vec<Shot> = (0..faces)
-        .filter_map(|k| {
-            let shot = shot(first_seed + k);
-            done(k + 1);
+    let shots: Vec<Shot> = (first_seed..first_seed + faces)
+        .filter_map(|seed| {
+            let shot = shot(&Unit::sample(seed), face_of(seed), seed);
+            done(seed - first_seed + 1);
             shot
         })
         .collect();
     let mut corrections = Corrections::default();
     cue_factors(model, &shots, &mut corrections);
-    // every candidate speaks: thresholds come from what they say
-    let open = Thresholds {
-        accept: 0.005,
-        review: 0.004,
-        other: 0.999_99,
-        ..model.settings.thresholds
-    };
-    let detector = with(
-        model,
-        Settings {
-            thresholds: open,
-            corrections,
-            ..Settings::default()
+    // every candidate speaks, uncalibrated: what they say is what is calibrated
+    let open = Settings {
+        thresholds: Thresholds {
+            accept: 0.001,
+            review: 0.000_9,
+            other: 0.999_99,
+            ..model.settings.thresholds
         },
-    );
+        corrections,
+        ..Settings::default()
+    };
+    let detector = with(model, open);
     let (mut scores, mut unfound, mut screws) = (Vec::new(), 0, 0);
-    let (mut ratios, mut depth_ratios) = (Vec::new(), Vec::new());
+    let (mut ratios, mut depths) = (Vec::new(), [Vec::new(), Vec::new()]);
     for shot in &shots {
         let found = detector.detect(&shot.frame, &Options::default()).screws;
         screws += shot.truth.screws.iter().filter(|s| s.detectable).count();
         for truth in shot.truth.screws.iter().filter(|s| s.detectable) {
             let near = |s: &&Screw| s.pixel.distance_px(&truth.pixel) < 0.5 * truth.head_d_px;
-            match found
-                .iter()
-                .filter(|s| s.verdict != Verdict::Other)
-                .filter(near)
-                .max_by(|a, b| a.score.total_cmp(&b.score))
-            {
-                Some(find) => {
-                    scores.push((find.score, true));
-                    let error = errors(find.pixel, truth.pixel);
-                    ratios.extend(error.map(|e| e / find.sigma_px));
-                    if let (Some(point), Some(sigma)) = (find.camera, find.sigma_depth_mm) {
-                        depth_ratios.push((point.z_mm() - truth.point.z_mm()).abs() / sigma);
-                    }
-                }
-                None => unfound += 1,
+            let finds = found.iter().filter(|s| s.verdict != Verdict::Other).filter(near);
+            let Some(find) = finds.max_by(|a, b| a.score.total_cmp(&b.score)) else {
+                unfound += 1;
+                continue;
+            };
+            scores.push((find.score, true));
+            let error = errors(find.pixel, truth.pixel);
+            ratios.extend(error.map(|e| e / find.sigma_px));
+            let (Some(depth), Some(camera)) = (&shot.frame.depth, &shot.frame.camera) else {
+                continue;
+            };
+            let at = locate(depth, camera, find.pixel, find.sigma_px, find.diameter_px, &corrections);
+            if let Some(at) = at {
+                let head_mm = find.diameter_px * camera.pixel_mm(at.point.z_mm());
+                depths[at.source as usize].push(DepthError {
+                    too_far_mm: at.point.z_mm() - truth.point.z_mm(),
+                    head_mm: head_mm * at.normal.vector().z.abs(),
+                    sigma_mm: at.sigma_depth_mm,
+                });
             }
         }
         for find in found.iter().filter(|s| s.verdict != Verdict::Other) {
@@ -109,8 +97,22 @@ pub fn tune(model: &Model, first_seed: u64, faces: u64, done: &dyn Fn(u64)) -> T
         }
     }
     corrections.fused_sigma *= one_sigma(ratios);
+    let mut depth_ratios = Vec::new();
+    for (rise, errors) in corrections.depth_rise.iter_mut().zip(&depths) {
+        *rise = median(errors.iter().map(|e| e.too_far_mm / e.head_mm).collect());
+        depth_ratios.extend(
+            errors
+                .iter()
+                .map(|e| (e.too_far_mm - *rise * e.head_mm).abs() / e.sigma_mm),
+        );
+    }
     corrections.depth_sigma *= one_sigma(depth_ratios);
-    let (accept, review, cost) = choose(&scores);
+    (corrections.score_slope, corrections.score_offset) = platt(&scores);
+    for (score, _) in &mut scores {
+        *score = logistic(corrections.score_slope * logit(*score) + corrections.score_offset);
+    }
+    // with scores that are probabilities, least expected cost is a matter of the costs alone
+    let (accept, review) = (1.0 - LOOK / FALSE_FIND, LOOK / MISS);
     Tuning {
         thresholds: Thresholds {
             accept: accept as f32,
@@ -121,8 +123,14 @@ pub fn tune(model: &Model, first_seed: u64, faces: u64, done: &dyn Fn(u64)) -> T
         faces,
         screws,
         without_candidate: unfound,
-        cost_a_face: (cost + MISS * unfound as f64) / shots.len().max(1) as f64,
+        cost_a_face: (cost(&scores, accept, review) + MISS * unfound as f64) / shots.len().max(1) as f64,
     }
+}
+
+struct DepthError {
+    too_far_mm: f64,
+    head_mm: f64,
+    sigma_mm: f64,
 }
 
 fn with(model: &Model, settings: Settings) -> Detector {
@@ -136,64 +144,110 @@ fn errors(found: Pixel, truth: Pixel) -> [f64; 2] {
 }
 
 /// The factor that brings 68.3 % of errors within one sigma.
-fn one_sigma(mut ratios: Vec<f64>) -> f64 {
-    if ratios.len() < 20 {
+fn one_sigma(ratios: Vec<f64>) -> f64 {
+    if ratios.len() < ENOUGH {
         return 1.0;
     }
-    ratios.sort_by(f64::total_cmp);
-    ratios[(0.6827 * ratios.len() as f64) as usize].clamp(0.2, 10.0)
+    quantile(ratios, ONE_SIGMA).clamp(0.1, 20.0)
 }
 
-/// Each cue alone against truth.
+fn quantile(mut values: Vec<f64>, share: f64) -> f64 {
+    values.sort_by(f64::total_cmp);
+    values[(share * values.len() as f64) as usize]
+}
+
+fn median(mut values: Vec<f64>) -> f64 {
+    values.sort_by(f64::total_cmp);
+    values.get(values.len() / 2).copied().unwrap_or(0.0)
+}
+
+/// Each cue alone against truth, from where a detection starts it.
 fn cue_factors(model: &Model, shots: &[Shot], corrections: &mut Corrections) {
-    let detector = with(model, model.settings.clone());
     let (mut circles, mut crosses, mut learned) = (Vec::new(), Vec::new(), Vec::new());
     for shot in shots {
         let picture = &shot.frame.color;
-        for find in detector.detect(&shot.frame, &Options::default()).screws {
-            let near = |s: &&scene::ScrewTruth| s.detectable && s.pixel.distance_px(&find.pixel) < 0.5 * s.head_d_px;
-            let Some(truth) = shot.truth.screws.iter().find(near) else {
+        let places: Vec<_> = candidates(&coarse_map(&model.coarse, picture), &model.settings.thresholds)
+            .iter()
+            .map(|c| c.pixel)
+            .collect();
+        let evidence = look(&model.fine, picture, &places);
+        for truth in shot.truth.screws.iter().filter(|s| s.detectable) {
+            let at = |e: &Evidence| Pixel::new(e.center.u_px, e.center.v_px);
+            let near =
+                |e: &&Evidence| at(e).distance_px(&truth.pixel) < 0.5 * truth.head_d_px && e.of(Class::Cross) > 0.5;
+            let finds = evidence.iter().filter(near);
+            let Some(find) = finds.max_by(|a, b| a.of(Class::Cross).total_cmp(&b.of(Class::Cross))) else {
                 continue;
             };
-            if let Some(c) = outer_circle(picture, find.pixel, find.diameter_px) {
-                circles.extend(errors(c.center.pixel, truth.pixel).map(|e| e / c.center.sigma_px));
+            learned.extend(errors(at(find), truth.pixel).map(|e| e / find.sigma_px));
+            if let Some(c) = outer_circle(picture, at(find), find.diameter_px) {
+                circles.extend(errors(c.center.pixel, truth.pixel).map(|e| e / c.diameter_px));
             }
-            if let Some(c) = cross(picture, find.pixel, find.diameter_px) {
+            if let Some(c) = cross(picture, at(find), find.diameter_px) {
                 crosses.extend(errors(c.center.pixel, truth.pixel).map(|e| e / c.center.sigma_px));
-            }
-            if find.cues == [Cue::Learned] {
-                learned.extend(errors(find.pixel, truth.pixel).map(|e| e / find.sigma_px));
             }
         }
     }
-    corrections.circle_sigma = one_sigma(circles);
+    if circles.len() >= ENOUGH {
+        // how well the outline is seen says little about where the recess is: eccentricity is what there is to measure
+        corrections.eccentricity = quantile(circles, ONE_SIGMA);
+    }
     corrections.cross_sigma = one_sigma(crosses);
     corrections.learned_sigma = one_sigma(learned);
 }
 
-/// Thresholds of least cost over all candidates: accepted and false, dropped and true, and looks in between.
-fn choose(scores: &[(f64, bool)]) -> (f64, f64, f64) {
-    let grid: Vec<f64> = (-48..=48)
-        .map(|k| 1.0 / (1.0 + (-0.125 * f64::from(k)).exp()))
-        .collect();
-    let mut best = (0.5, 0.3, f64::INFINITY);
-    for (i, &accept) in grid.iter().enumerate().filter(|(_, a)| **a >= 0.3) {
-        for &review in &grid[..=i] {
-            let cost: f64 = scores
-                .iter()
-                .map(|&(score, real)| match (score >= accept, score >= review, real) {
-                    (true, _, true) | (false, false, false) => 0.0,
-                    (true, _, false) => FALSE_FIND,
-                    (false, true, _) => LOOK,
-                    (false, false, true) => MISS,
-                })
-                .sum();
-            if cost < best.2 - 1e-9 {
-                best = (accept, review, cost);
-            }
-        }
+fn logit(p: f64) -> f64 {
+    let p = p.clamp(1e-7, 1.0 - 1e-7);
+    (p / (1.0 - p)).ln()
+}
+
+fn logistic(odds: f64) -> f64 {
+    1.0 / (1.0 + (-odds).exp())
+}
+
+/// Slope and offset in log odds that make scores probabilities (Platt 1999, with his guard against overconfidence).
+fn platt(scores: &[(f64, bool)]) -> (f64, f64) {
+    let real = scores.iter().filter(|s| s.1).count() as f64;
+    let not = scores.len() as f64 - real;
+    if real < 10.0 || not < 10.0 {
+        return (1.0, 0.0);
     }
-    best
+    let targets = [1.0 / (not + 2.0), (real + 1.0) / (real + 2.0)];
+    let (mut slope, mut offset) = (1.0, 0.0);
+    for _ in 0..100 {
+        // Newton's step on the cross-entropy, with a little weight on the slope's staying where it is
+        let (mut g, mut h) = ([0.1 * (slope - 1.0), 0.0], [0.1, 0.0, 1e-6]);
+        for &(score, real) in scores {
+            let x = logit(score);
+            let p = logistic(slope * x + offset);
+            let (miss, weight) = (p - targets[usize::from(real)], (p * (1.0 - p)).max(1e-9));
+            g = [g[0] + miss * x, g[1] + miss];
+            h = [h[0] + weight * x * x, h[1] + weight * x, h[2] + weight];
+        }
+        let determinant = h[0] * h[2] - h[1] * h[1];
+        let step = [
+            (h[2] * g[0] - h[1] * g[1]) / determinant,
+            (h[0] * g[1] - h[1] * g[0]) / determinant,
+        ];
+        (slope, offset) = (
+            (slope - step[0].clamp(-0.3, 0.3)).clamp(0.2, 3.0),
+            offset - step[1].clamp(-1.0, 1.0),
+        );
+    }
+    (slope, offset)
+}
+
+/// Cost of all candidates at thresholds: false ones accepted, true ones dropped, and looks in between.
+fn cost(scores: &[(f64, bool)], accept: f64, review: f64) -> f64 {
+    scores
+        .iter()
+        .map(|&(score, real)| match (score >= accept, score >= review, real) {
+            (true, _, true) | (false, false, false) => 0.0,
+            (true, _, false) => FALSE_FIND,
+            (false, true, _) => LOOK,
+            (false, false, true) => MISS,
+        })
+        .sum()
 }
 
 #[cfg(test)]
@@ -201,17 +255,29 @@ mod tests {
     use super::*;
 
     #[test]
-    fn thresholds_follow_the_costs() {
-        // true screws at 0.9, decoys at 0.2, one doubtful pair in the middle: a look is cheaper than either mistake
-        let mut scores = vec![(0.9, true); 50];
-        scores.extend(vec![(0.2, false); 50]);
-        scores.extend([(0.6, true), (0.6, false)]);
-        let (accept, review, cost) = choose(&scores);
+    fn calibrated_scores_are_probabilities_and_thresholds_follow_the_costs() {
+        // scores that claim too much: the odds are the square of what they should be
+        let mut scores = Vec::new();
+        for k in 1..40 {
+            let p = f64::from(k) / 40.0;
+            let real = (1000.0 * p).round() as usize;
+            scores.extend((0..1000).map(|i| (logistic(2.0 * logit(p) + 0.5), i < real)));
+        }
+        let (slope, offset) = platt(&scores);
         assert!(
-            accept > 0.6 && accept <= 0.9 && review <= 0.6 && review > 0.2,
-            "{accept} {review}"
+            (slope - 0.5).abs() < 0.01 && (offset + 0.25).abs() < 0.02,
+            "{slope} {offset}"
         );
-        assert!((cost - 2.0 * LOOK).abs() < 1e-9);
+        let calibrated: Vec<(f64, bool)> = scores
+            .iter()
+            .map(|&(s, real)| (logistic(slope * logit(s) + offset), real))
+            .collect();
+        let (accept, review) = (1.0 - LOOK / FALSE_FIND, LOOK / MISS);
+        let best = cost(&calibrated, accept, review);
+        for off in [-0.1, 0.1] {
+            assert!(cost(&calibrated, accept + off, review) > best);
+            assert!(cost(&calibrated, accept, review + off) > best);
+        }
     }
 
     #[test]

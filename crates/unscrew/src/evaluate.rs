@@ -1,4 +1,5 @@
-//! `unscrew evaluate`: what the detector is worth, with bounds: on rendered faces, on pictures with exact truth, on photographs.
+//! `unscrew evaluate`: what the detector is worth, with bounds: on rendered faces, on pictures with exact truth, on photographs,
+//! on crops.
 
 use crate::{Ended, detect::head_range, output};
 use anyhow::{Result, bail};
@@ -10,16 +11,18 @@ use std::{
     path::{Path, PathBuf},
     sync::atomic::Ordering,
 };
-use training::{EvaluateError, Evaluator, FIRST_EVALUATION_SEED, Product, evaluate_yolo_folder, truth_files};
+use training::{
+    EvaluateError, Evaluator, FIRST_EVALUATION_SEED, Product, evaluate_crops, evaluate_yolo_folder, truth_files,
+};
 use vision::{Detector, Options};
 
 /// Measures the detector: recall, precision and centre error with 95 % bounds, by wear and by what may be taken for a screw.
 ///
 /// On rendered faces that training never saw; with --truth on a folder of pictures with exact truth; with --photos on photographs
-/// with boxes.
+/// with boxes; with --crops on real crops that training left out, which stage 2 alone tells apart.
 #[derive(clap::Args)]
 #[command(
-    after_help = "Examples:\n  unscrew evaluate --faces 300 --out figures.json\n  unscrew evaluate --gauge --faces 20\n  unscrew evaluate --truth rendered_faces\n  unscrew evaluate --photos appliance_scenes --scene calc_side --head-px 15..80"
+    after_help = "Examples:\n  unscrew evaluate --faces 300 --out figures.json\n  unscrew evaluate --gauge --faces 20\n  unscrew evaluate --truth rendered_faces\n  unscrew evaluate --photos appliance_scenes --scene calc_side --head-px 15..80\n  unscrew evaluate --crops crates/training/data"
 )]
 pub struct Args {
     /// Rendered faces to measure on, each of its own unit
@@ -37,6 +40,9 @@ pub struct Args {
     /// Folder with images/, labels/ (YOLO, class 1: cross recess, 0: hexagon) and manifest.csv (file, scene), instead of rendered faces
     #[arg(long, value_name = "DIR", conflicts_with_all = ["faces", "seed"])]
     photos: Option<PathBuf>,
+    /// Folder of the training data with ewaste.csv and ewaste_*.jpg, for its held-out crops, instead of rendered faces
+    #[arg(long, value_name = "DIR", conflicts_with_all = ["faces", "seed", "gauge", "truth", "photos", "scene", "head_px"])]
+    crops: Option<PathBuf>,
     /// Only the photographs of these scenes
     #[arg(long, value_name = "NAME", num_args = 1.., requires = "photos")]
     scene: Vec<String>,
@@ -65,6 +71,10 @@ pub fn run(args: &Args) -> Result<Ended> {
             .filter(|p| !p.as_os_str().is_empty())
             .unwrap_or(Path::new("."));
         output::prepare_folder(folder)?;
+    }
+    if let Some(data) = &args.crops {
+        say(args, &evaluate_crops(&detector, data)?)?;
+        return Ok(Ended::Good);
     }
     let usual = Options::default();
     let usual_px = if args.photos.is_some() {

@@ -21,6 +21,9 @@ pub struct Args {
     /// Folder of the real photographs
     #[arg(long, default_value = "crates/training/data", value_name = "DIR")]
     data: PathBuf,
+    /// Folder for what has been rendered and learned so far: a training that was stopped goes on from there
+    #[arg(long, value_name = "DIR")]
+    work: Option<PathBuf>,
     /// Model to train further; left out, training starts anew
     #[arg(long, value_name = "FILE")]
     from: Option<PathBuf>,
@@ -33,9 +36,12 @@ pub struct Args {
     /// Steps of the coarse network
     #[arg(long, default_value_t = TrainSettings::default().coarse_steps)]
     coarse_steps: usize,
-    /// Steps of each fine network
+    /// Steps of each fine network, those that they share included
     #[arg(long, default_value_t = TrainSettings::default().fine_steps)]
     fine_steps: usize,
+    /// First steps, which the fine networks share
+    #[arg(long, default_value_t = TrainSettings::default().shared_steps)]
+    shared_steps: usize,
     /// First learning rate
     #[arg(long, default_value_t = TrainSettings::default().learning_rate)]
     learning_rate: f32,
@@ -77,12 +83,17 @@ pub fn run(args: &Args) -> Result<Ended> {
     if let Some(folder) = folder {
         output::prepare_folder(folder)?;
     }
+    if let Some(folder) = &args.work {
+        output::prepare_folder(folder)?;
+    }
     let settings = TrainSettings {
         from: args.from.clone(),
+        work: args.work.clone(),
         first_unit: args.first_unit,
         units: args.units,
         coarse_steps: args.coarse_steps,
         fine_steps: args.fine_steps,
+        shared_steps: args.shared_steps,
         learning_rate: args.learning_rate,
         tuning_faces: args.tuning_faces,
         seed: args.seed,

@@ -129,11 +129,11 @@ pub fn fine_spec() -> Spec {
     Spec {
         input_channels: 3,
         layers: vec![
-            conv(3, 2, 1, 24),
-            conv(3, 2, 1, 48),
-            conv(3, 1, 1, 48),
-            conv(3, 1, 2, 48),
-            conv(3, 1, 2, 48),
+            conv(3, 2, 1, 32),
+            conv(3, 2, 1, 64),
+            conv(3, 1, 1, 64),
+            conv(3, 1, 2, 64),
+            conv(3, 1, 2, 64),
             output(FINE_CHANNELS),
         ],
     }

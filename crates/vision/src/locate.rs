@@ -17,13 +17,13 @@ const RIM_HEIGHT: [f64; 2] = [0.27, 0.09];
 const STEEPEST: f64 = 1.0;
 /// Stereo errors of neighbouring measurements go together: so many count as one.
 const MEASUREMENTS_A_SAMPLE: f64 = 4.0;
-/// What a depth rests on.
+/// What a depth rests on; the value is its place in [`Corrections::depth_rise`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum DepthSource {
     /// The head's top around the recess.
-    Head,
+    Head = 0,
     /// The sheet around the head, and the usual height of heads.
-    Sheet,
+    Sheet = 1,
 }
 
 /// A screw in space.
@@ -70,8 +70,15 @@ pub fn locate(
         let depth_mm = plane.depth_mm - rise * head_mm * normal.vector().z.abs();
         Some((plane, depth_mm, spread * head_mm, normal, source))
     };
-    let top = || rim(ring(TOP_RING)?, DOME, DepthSource::Head);
-    let sheet = || rim(ring(SHEET_RING)?, RIM_HEIGHT, DepthSource::Sheet);
+    let more = |[rise, spread]: [f64; 2], source| [rise + corrections.depth_rise[source as usize], spread];
+    let top = || rim(ring(TOP_RING)?, more(DOME, DepthSource::Head), DepthSource::Head);
+    let sheet = || {
+        rim(
+            ring(SHEET_RING)?,
+            more(RIM_HEIGHT, DepthSource::Sheet),
+            DepthSource::Sheet,
+        )
+    };
     let (plane, depth_mm, spread_mm, normal, source) = top().or_else(sheet)?;
     Some(Located {
         point: camera.unproject(pixel, depth_mm),

@@ -64,6 +64,9 @@ pub struct Corrections {
     pub learned_sigma: f64,
     /// True error over stated sigma of the fused centre.
     pub fused_sigma: f64,
+    /// How much nearer to the camera a rim is than depth measured on the head's top and on the sheet around it say, in head
+    /// diameters: stereo's window sees slot, flank and sheet with the rim.
+    pub depth_rise: [f64; 2],
     /// True error over stated sigma of the depth at the rim.
     pub depth_sigma: f64,
     /// Slope of the score in log odds (Platt 1999).
@@ -80,6 +83,7 @@ impl Default for Corrections {
             cross_sigma: 1.0,
             learned_sigma: 1.0,
             fused_sigma: 1.0,
+            depth_rise: [0.0; 2],
             depth_sigma: 1.0,
             score_slope: 1.0,
             score_offset: 0.0,

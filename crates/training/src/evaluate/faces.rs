@@ -1,25 +1,22 @@
-//! What a detector is worth: its finds beside the truth, as rates with bounds.
-//!
-//! Three sources of truth: rendered faces that training never saw ([`evaluate_faces`]), a folder of pictures with exact truth from
-//! anywhere ([`evaluate_truth_folder`]), and photographs with boxes drawn by people ([`evaluate_yolo_folder`]).
+//! Rendered faces, and folders of pictures with exact truth.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::fmt::{self, Display, Formatter};
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
-use geometry::{Camera, CameraModel, FileError, Pixel, Point, RgbImage, RgbdFrame, read_color, read_depth};
-use rand::SeedableRng;
-use rand_pcg::Pcg64Mcg;
+use geometry::{Camera, CameraModel, Pixel, Point, Rate, RgbdFrame, read_color, read_depth};
 use scene::fastener::Decoy;
-use scene::{FaceId, FaceTruth, FaceView, Prepared, Unit};
+use scene::{FaceId, FaceTruth, Unit};
 use serde::{Deserialize, Serialize};
 use vision::layout::TRAINED_HEAD_PX;
-use vision::{Detections, Detector, Drive, Options, Screw, Timing, Verdict, candidates, coarse_map, look};
+use vision::{Detections, Detector, Drive, Options, Screw, Timing, Verdict, candidates, coarse_map};
 
-use crate::real;
-use crate::samples::{PATCH_PX, any_fastener};
-use crate::train::TrainError;
+use super::{
+    Coverage, EvaluateError, FalseFind, Miss, Quantiles, Share, cut, list, percent, read_text, speaker, unreadable,
+    word, write_lists,
+};
+use crate::face::{Shot, face_of, shot};
 
 /// Seeds from here on are for evaluation, smaller ones for training.
 pub const FIRST_EVALUATION_SEED: u64 = 1_000_000;
@@ -30,47 +27,6 @@ const ON_SCREW: f64 = 0.5;
 const ON_DECOY: f64 = 1.0;
 /// A decoy of which less than this shows cannot be judged.
 const DECOY_SHOWS: f64 = 0.5;
-/// A find and a person's box are the same thing from this overlap on (intersection over union).
-const SAME_BOX: f64 = 0.3;
-/// Misses and false finds that are listed one by one.
-const LISTED: usize = 200;
-/// Of these, in the table for a terminal.
-const PRINTED: usize = 12;
-
-/// Why there is nothing to say. Each message names what, where and what to do.
-#[derive(Debug, thiserror::Error)]
-pub enum EvaluateError {
-    /// The seed may have been trained on.
-    #[error(
-        "seed {seed} belongs to training; figures on it would flatter: give a seed of {FIRST_EVALUATION_SEED} or more"
-    )]
-    TrainingSeed {
-        /// The seed.
-        seed: u64,
-    },
-    /// A picture, depth or text that cannot be read.
-    #[error(transparent)]
-    File(#[from] FileError),
-    /// A file with truth, labels or scenes that cannot be understood.
-    #[error("{path}: {reason}")]
-    Format {
-        /// The file.
-        path: PathBuf,
-        /// What is wrong and what is expected.
-        reason: String,
-    },
-    /// The training data's folder.
-    #[error(transparent)]
-    Data(#[from] TrainError),
-    /// A folder without anything to measure on.
-    #[error("nothing to evaluate in {path}: {reason}")]
-    Nothing {
-        /// The folder or file.
-        path: PathBuf,
-        /// What was looked for.
-        reason: String,
-    },
-}
 
 /// What is rendered.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -81,130 +37,6 @@ pub enum Product {
     Units,
     /// The paper's gauge: a plate with nothing but screws.
     Gauge,
-}
-
-/// A share with its 95 % bounds.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
-pub struct Rate {
-    /// How many were.
-    pub hits: usize,
-    /// Of how many.
-    pub of: usize,
-    /// hits / of; `None` of nothing.
-    pub rate: Option<f64>,
-    /// Lower 95 % bound.
-    pub low: f64,
-    /// Upper 95 % bound.
-    pub high: f64,
-}
-
-impl Rate {
-    /// A share with its Wilson score bounds.
-    pub fn of(hits: usize, of: usize) -> Self {
-        let (low, high) = wilson(hits, of);
-        Self {
-            hits,
-            of,
-            rate: (of > 0).then(|| hits as f64 / of as f64),
-            low,
-            high,
-        }
-    }
-}
-
-impl Display for Rate {
-    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
-        match self.rate {
-            Some(rate) => write!(
-                f,
-                "{:6.2} %  ({} of {}; 95 %: {:.2} to {:.2} %)",
-                100.0 * rate,
-                self.hits,
-                self.of,
-                100.0 * self.low,
-                100.0 * self.high
-            ),
-            None => write!(f, "     -    (of none)"),
-        }
-    }
-}
-
-/// 95 % bounds of a binomial share (Wilson 1927); (0, 1) of nothing.
-pub fn wilson(hits: usize, of: usize) -> (f64, f64) {
-    if of == 0 {
-        return (0.0, 1.0);
-    }
-    wilson_share(hits as f64 / of as f64, of as f64)
-}
-
-fn wilson_share(p: f64, n: f64) -> (f64, f64) {
-    const Z: f64 = 1.959_963_984_540_054;
-    let center = p + Z * Z / (2.0 * n);
-    let half = Z * (p * (1.0 - p) / n + Z * Z / (4.0 * n * n)).sqrt();
-    let scale = 1.0 + Z * Z / n;
-    (((center - half) / scale).max(0.0), ((center + half) / scale).min(1.0))
-}
-
-/// How large errors are.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Quantiles {
-    /// Number of errors.
-    pub n: usize,
-    /// Half are smaller.
-    pub median: f64,
-    /// 95 % are smaller.
-    pub p95: f64,
-    /// 99 % are smaller.
-    pub p99: f64,
-    /// The largest.
-    pub max: f64,
-}
-
-impl Quantiles {
-    /// Of some errors, interpolated between neighbours; `None` of none.
-    pub fn of(errors: &[f64]) -> Option<Self> {
-        let mut sorted = errors.to_vec();
-        sorted.sort_by(f64::total_cmp);
-        let &max = sorted.last()?;
-        let at = |q: f64| {
-            let place = q * (sorted.len() - 1) as f64;
-            let (low, part) = (place as usize, place.fract());
-            let high = sorted[(low + 1).min(sorted.len() - 1)];
-            sorted[low] + part * (high - sorted[low])
-        };
-        Some(Self {
-            n: sorted.len(),
-            median: at(0.5),
-            p95: at(0.95),
-            p99: at(0.99),
-            max,
-        })
-    }
-}
-
-/// Whether sigmas are honest: shares of errors within one (should be 68.3 %) and 1.96 of them (95 %).
-#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
-pub struct Coverage {
-    /// Within one sigma.
-    pub one_sigma: Rate,
-    /// Within 1.96 sigma.
-    pub two_sigma: Rate,
-}
-
-impl Coverage {
-    /// Of errors in units of their own sigma.
-    pub fn of(relative_errors: &[f64]) -> Self {
-        let within = |limit: f64| {
-            Rate::of(
-                relative_errors.iter().filter(|e| e.abs() <= limit).count(),
-                relative_errors.len(),
-            )
-        };
-        Self {
-            one_sigma: within(1.0),
-            two_sigma: within(1.96),
-        }
-    }
 }
 
 /// What became of a kind of decoy.
@@ -233,42 +65,6 @@ pub struct DriveRow {
     pub found: usize,
     /// Of the found, with the right drive.
     pub right: usize,
-}
-
-/// A cross screw that was not called `screw`.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Miss {
-    /// The picture: a face's seed and name, or a file.
-    pub picture: String,
-    /// Where it is, px.
-    pub u_px: f64,
-    /// Where it is, px.
-    pub v_px: f64,
-    /// Its head, px.
-    pub head_d_px: f64,
-    /// Head, plating and wear; of a photograph its scene.
-    pub tags: Vec<String>,
-    /// What it was called instead: `review`, `other`, or `nothing`.
-    pub called: String,
-    /// Score of that find.
-    pub score: Option<f64>,
-    /// Whether stage 1 had a candidate there.
-    pub candidate: Option<bool>,
-}
-
-/// A find of verdict `screw` where there is no cross screw.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct FalseFind {
-    /// The picture: a face's seed and name, or a file.
-    pub picture: String,
-    /// Where it is, px.
-    pub u_px: f64,
-    /// Where it is, px.
-    pub v_px: f64,
-    /// What is there: a kind of decoy, or `background`.
-    pub kind: String,
-    /// Its score.
-    pub score: f64,
 }
 
 /// Stage 1 alone.
@@ -421,17 +217,6 @@ pub fn truth_files(folder: &Path) -> Result<Vec<PathBuf>, EvaluateError> {
     Ok(paths)
 }
 
-fn unreadable(path: &Path, source: std::io::Error) -> EvaluateError {
-    EvaluateError::File(FileError::Read {
-        path: path.into(),
-        source,
-    })
-}
-
-fn read_text(path: &Path) -> Result<String, EvaluateError> {
-    std::fs::read_to_string(path).map_err(|source| unreadable(path, source))
-}
-
 /// Measures a detector picture by picture, for whoever wants to stop in between; [`evaluate_faces`] and
 /// [`evaluate_truth_folder`] do all in one.
 pub struct Evaluator<'a> {
@@ -463,10 +248,7 @@ impl<'a> Evaluator<'a> {
             return Err(EvaluateError::TrainingSeed { seed });
         }
         let (unit, face, source) = match product {
-            Product::Units => {
-                let face = FaceId::ALL[(seed % FaceId::ALL.len() as u64) as usize];
-                (Unit::sample(seed), face, "rendered faces of outdoor units")
-            }
+            Product::Units => (Unit::sample(seed), face_of(seed), "rendered faces of outdoor units"),
             Product::Gauge => (
                 Unit::gauge(seed),
                 FaceId::Front,
@@ -476,18 +258,10 @@ impl<'a> Evaluator<'a> {
         self.source = source.into();
         let [first, last] = self.seeds.unwrap_or([seed; 2]);
         self.seeds = Some([first.min(seed), last.max(seed)]);
-        let Some(view) = FaceView::sample(&unit, face, seed) else {
+        let Some(Shot { frame, truth }) = shot(&unit, face, seed) else {
             return Ok(()); // a unit without that face
         };
-        let prepared = Prepared::new(&view);
-        let rendered = prepared.render(None);
-        let frame = RgbdFrame {
-            color: rendered.color,
-            depth: Some(rendered.depth),
-            camera: Some(view.camera),
-            t_s: 0.0,
-        };
-        let truth = Truth::of_face(format!("{seed} {}", face.name()), face.name(), &prepared.truth());
+        let truth = Truth::of_face(format!("{seed} {}", face.name()), face.name(), &truth);
         self.measure(&frame, &truth);
         Ok(())
     }
@@ -653,14 +427,6 @@ impl Truth {
     }
 }
 
-/// The snake-case name of an enum's value, as in the files.
-fn word(value: &impl Serialize) -> String {
-    match serde_json::to_value(value) {
-        Ok(serde_json::Value::String(word)) => word,
-        _ => "unknown".into(),
-    }
-}
-
 /// What a find is about.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Subject {
@@ -687,36 +453,6 @@ fn subject(truth: &Truth, at: Pixel) -> Subject {
         .map(Subject::Screw)
         .or_else(|| decoy().map(Subject::Decoy))
         .unwrap_or(Subject::Background)
-}
-
-/// The find that speaks for an item: an action weighs more than a question, a question more than a note.
-fn speaker<'a>(finds: impl Iterator<Item = &'a Screw>, at: Pixel) -> Option<&'a Screw> {
-    let rank = |s: &Screw| match s.verdict {
-        Verdict::Screw => 0,
-        Verdict::Review => 1,
-        Verdict::Other => 2,
-    };
-    finds.min_by(|a, b| {
-        let far = |s: &Screw| s.pixel.distance_px(&at);
-        rank(a).cmp(&rank(b)).then(far(a).total_cmp(&far(b)))
-    })
-}
-
-#[derive(Clone, Copy, Default)]
-struct Share {
-    hits: usize,
-    of: usize,
-}
-
-impl Share {
-    fn add(&mut self, hit: bool) {
-        self.hits += usize::from(hit);
-        self.of += 1;
-    }
-
-    fn rate(self) -> Rate {
-        Rate::of(self.hits, self.of)
-    }
 }
 
 struct CenterError {
@@ -866,40 +602,6 @@ impl Tally {
     }
 }
 
-/// Adds to a list that does not grow without end.
-fn list<T>(list: &mut Vec<T>, entry: impl FnOnce() -> T) {
-    if list.len() < LISTED {
-        list.push(entry());
-    }
-}
-
-impl Miss {
-    fn new(picture: &str, at: Pixel, head_d_px: f64, tags: Vec<String>, find: Option<&Screw>) -> Self {
-        Self {
-            picture: picture.into(),
-            u_px: at.u_px,
-            v_px: at.v_px,
-            head_d_px,
-            tags,
-            called: find.map_or("nothing".into(), |f| word(&f.verdict)),
-            score: find.map(|f| f.score),
-            candidate: None,
-        }
-    }
-}
-
-impl FalseFind {
-    fn new(picture: &str, find: &Screw, kind: &str) -> Self {
-        Self {
-            picture: picture.into(),
-            u_px: find.pixel.u_px,
-            v_px: find.pixel.v_px,
-            kind: kind.into(),
-            score: find.score,
-        }
-    }
-}
-
 /// A truth file; fields that are not needed here are ignored.
 #[derive(Deserialize)]
 struct TruthFile {
@@ -1004,379 +706,6 @@ impl TruthFile {
     }
 }
 
-/// The photographs of one scene.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-pub struct SceneRow {
-    /// Photographs of it.
-    pub photos: usize,
-    /// Distinct cross screws: the most that one photograph shows.
-    pub distinct: usize,
-    /// Share of the cross screws found, mean over its photographs; `None` without cross screws.
-    pub found: Option<f64>,
-    /// False finds a photograph.
-    pub false_finds_mean: f64,
-}
-
-/// What a detector is worth on photographs with boxes drawn by people.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct PhotoEvaluation {
-    /// What it was measured on.
-    pub source: String,
-    /// The model: `sha256:` and its hash.
-    pub model: String,
-    /// Head diameters that were looked for, px.
-    pub head_px: [f64; 2],
-    /// Number of photographs.
-    pub photos: usize,
-    /// Distinct cross screws: over all scenes, the most that one photograph shows.
-    pub distinct: usize,
-    /// Recall per distinct cross screw: the mean over the photographs of a scene, weighted with its distinct screws.
-    pub recall_distinct: Option<f64>,
-    /// Its 95 % bounds (Wilson, of that many distinct screws).
-    pub recall_distinct_bounds: [f64; 2],
-    /// Labelled cross screws found, copies counted as often as they occur.
-    pub recall: Rate,
-    /// Labelled cross screws found or left to a person.
-    pub recall_or_review: Rate,
-    /// Labelled cross screws reported with any verdict.
-    pub recall_any: Rate,
-    /// Finds of verdict `screw` on no labelled cross screw.
-    pub false_finds: usize,
-    /// The same a photograph.
-    pub false_finds_mean: f64,
-    /// Of these, on a labelled hexagon.
-    pub hex_called_screw: usize,
-    /// Labelled hexagons.
-    pub hexagons: usize,
-    /// Drive that reported labels were given: by label (`cross`, `hex`), then by drive.
-    pub drives: BTreeMap<String, BTreeMap<String, usize>>,
-    /// By scene.
-    pub scenes: BTreeMap<String, SceneRow>,
-    /// Labelled cross screws not found, at most 200.
-    pub misses: Vec<Miss>,
-    /// False finds, at most 200.
-    pub false_list: Vec<FalseFind>,
-    /// Mean time a photograph, ms.
-    pub total_ms: f64,
-}
-
-/// A box drawn by a person, px.
-#[derive(Clone, Copy, Debug, PartialEq)]
-struct Label {
-    cross: bool,
-    low: [f64; 2],
-    high: [f64; 2],
-}
-
-impl Label {
-    fn center(&self) -> Pixel {
-        Pixel::new(0.5 * (self.low[0] + self.high[0]), 0.5 * (self.low[1] + self.high[1]))
-    }
-
-    /// True if the find's centre lies in the box, or its own box is much the same.
-    fn holds(&self, find: &Screw) -> bool {
-        let at = [find.pixel.u_px, find.pixel.v_px];
-        if (0..2).all(|k| at[k] >= self.low[k] && at[k] <= self.high[k]) {
-            return true;
-        }
-        let (mut both, mut own) = (1.0, 1.0);
-        for ((at, low), high) in at.into_iter().zip(self.low).zip(self.high) {
-            let half = 0.5 * find.diameter_px;
-            both *= (high.min(at + half) - low.max(at - half)).max(0.0);
-            own *= high - low;
-        }
-        both > SAME_BOX * (find.diameter_px * find.diameter_px + own - both)
-    }
-}
-
-/// Lines of `class x y w h`, or `class x1 y1 x2 y2 x3 y3 ...` (a polygon), as shares of the picture's size.
-fn parse_labels(text: &str, size_px: (u32, u32)) -> Result<Vec<Label>, String> {
-    let size = [f64::from(size_px.0), f64::from(size_px.1)];
-    let mut labels = Vec::new();
-    for (line, number) in text.lines().zip(1..) {
-        let fields: Vec<&str> = line.split_whitespace().collect();
-        let [class, numbers @ ..] = fields.as_slice() else {
-            continue;
-        };
-        let cross = match *class {
-            "0" => false,
-            "1" => true,
-            other => {
-                return Err(format!(
-                    "line {number}: class {other}; expected 0 (hexagon) or 1 (cross)"
-                ));
-            }
-        };
-        let finite = |n: &&str| n.parse().ok().filter(|v: &f64| v.is_finite());
-        let values: Option<Vec<f64>> = numbers.iter().map(finite).collect();
-        let values = values.ok_or_else(|| format!("line {number}: expected numbers after the class"))?;
-        let (low, high) = match values.as_slice() {
-            [x, y, w, h] => ([x - 0.5 * w, y - 0.5 * h], [x + 0.5 * w, y + 0.5 * h]),
-            corners if corners.len() >= 6 && corners.len() % 2 == 0 => {
-                let each = |k: usize| corners.iter().skip(k).step_by(2).copied();
-                (
-                    [0, 1].map(|k| each(k).fold(f64::MAX, f64::min)),
-                    [0, 1].map(|k| each(k).fold(f64::MIN, f64::max)),
-                )
-            }
-            _ => {
-                let n = values.len();
-                return Err(format!(
-                    "line {number}: {n} numbers after the class; expected a box of 4 or a polygon"
-                ));
-            }
-        };
-        // shares are of areas: their 0 is the outer edge of pixel 0
-        let to_px = |share: [f64; 2]| [0, 1].map(|k| share[k] * size[k] - 0.5);
-        labels.push(Label {
-            cross,
-            low: to_px(low),
-            high: to_px(high),
-        });
-    }
-    Ok(labels)
-}
-
-/// The columns `file` and `scene` of a manifest.
-fn parse_manifest(text: &str) -> Result<Vec<(String, String)>, String> {
-    let mut lines = text.lines().zip(1..);
-    let fields = |line: &str| -> Vec<String> { line.split(',').map(|f| f.trim().to_owned()).collect() };
-    let header = lines.next().map(|(line, _)| fields(line)).unwrap_or_default();
-    let column = |name: &str| {
-        let place = header.iter().position(|h| h == name);
-        place.ok_or_else(|| format!("no column {name}; expected a CSV file with the columns file and scene"))
-    };
-    let (file, scene) = (column("file")?, column("scene")?);
-    let mut rows = Vec::new();
-    for (line, number) in lines.filter(|(l, _)| !l.trim().is_empty()) {
-        let row = fields(line);
-        if row.len() != header.len() {
-            return Err(format!(
-                "line {number} has {} fields, its header {}; names must not hold commas",
-                row.len(),
-                header.len()
-            ));
-        }
-        rows.push((row[file].clone(), row[scene].clone()));
-    }
-    Ok(rows)
-}
-
-/// Measures a detector on photographs with boxes in YOLO's format, class 1 a cross recess, 0 a hexagon.
-///
-/// Many photographs may be photometric copies of one another: figures are per scene first.
-///
-/// # Arguments
-/// * `manifest` – CSV with the columns `file` (in `images`) and `scene`.
-/// * `scenes` – only these; `None`: all.
-/// * `progress` – told the number of photographs done, and of all.
-///
-/// # Errors
-/// An [`EvaluateError`] that names the file.
-pub fn evaluate_yolo_folder(
-    detector: &Detector,
-    options: &Options,
-    images: &Path,
-    labels: &Path,
-    manifest: &Path,
-    scenes: Option<&[String]>,
-    progress: &(dyn Fn(u64, u64) + Sync),
-) -> Result<PhotoEvaluation, EvaluateError> {
-    let format = |path: &Path, reason: String| EvaluateError::Format {
-        path: path.into(),
-        reason,
-    };
-    let mut rows = parse_manifest(&read_text(manifest)?).map_err(|reason| format(manifest, reason))?;
-    if let Some(wanted) = scenes {
-        let known: BTreeSet<&str> = rows.iter().map(|(_, scene)| scene.as_str()).collect();
-        if let Some(unknown) = wanted.iter().find(|w| !known.contains(w.as_str())) {
-            let known: Vec<&str> = known.into_iter().collect();
-            let reason = format!("no scene {unknown}; there are {}", known.join(", "));
-            return Err(format(manifest, reason));
-        }
-        rows.retain(|(_, scene)| wanted.contains(scene));
-    }
-    if rows.is_empty() {
-        return Err(EvaluateError::Nothing {
-            path: manifest.into(),
-            reason: "it lists no photograph".into(),
-        });
-    }
-    let mut tally = PhotoTally::default();
-    for ((file, scene), done) in rows.iter().zip(1..) {
-        let picture = read_color(&images.join(file))?;
-        let path = labels.join(Path::new(file).with_extension("txt"));
-        let labels = parse_labels(&read_text(&path)?, picture.dimensions()).map_err(|reason| format(&path, reason))?;
-        tally.add(file, scene, &labels, &detector.detect_image(&picture, options));
-        progress(done, rows.len() as u64);
-    }
-    let head_px = [*options.head_px.start(), *options.head_px.end()];
-    let source = format!("photographs of {}", images.display());
-    Ok(tally.finish(source, detector.model().id(), head_px))
-}
-
-#[derive(Default)]
-struct PhotoTally {
-    photos: usize,
-    recall: Share,
-    review: usize,
-    any: usize,
-    hexagons: usize,
-    false_finds: usize,
-    hex_called_screw: usize,
-    drives: BTreeMap<String, BTreeMap<String, usize>>,
-    /// By scene: found and labelled cross screws, and false finds, of each photograph.
-    scenes: BTreeMap<String, Vec<(Share, usize)>>,
-    misses: Vec<Miss>,
-    false_list: Vec<FalseFind>,
-    total_ms: f64,
-}
-
-impl PhotoTally {
-    fn add(&mut self, file: &str, scene: &str, labels: &[Label], found: &Detections) {
-        self.photos += 1;
-        self.total_ms += found.timing_ms.total;
-        // a find belongs to the nearest box that holds it, so that one find cannot stand for two screws
-        let owner = |find: &Screw| {
-            let far = |l: &Label| l.center().distance_px(&find.pixel);
-            let held = labels.iter().enumerate().filter(|(_, l)| l.holds(find));
-            held.min_by(|a, b| far(a.1).total_cmp(&far(b.1))).map(|(k, _)| k)
-        };
-        let owners: Vec<Option<usize>> = found.screws.iter().map(owner).collect();
-        let (mut share, mut false_finds) = (Share::default(), 0);
-        for (k, label) in labels.iter().enumerate() {
-            let finds = found.screws.iter().zip(&owners);
-            let own = finds.filter(|(_, o)| **o == Some(k)).map(|(find, _)| find);
-            let find = speaker(own, label.center());
-            if let Some(find) = find {
-                let name = if label.cross { "cross" } else { "hex" };
-                let drives = self.drives.entry(name.into()).or_default();
-                *drives.entry(find.drive.name().into()).or_default() += 1;
-            }
-            if !label.cross {
-                self.hexagons += 1;
-                continue;
-            }
-            let hit = find.is_some_and(|f| f.verdict == Verdict::Screw);
-            share.add(hit);
-            self.recall.add(hit);
-            self.any += usize::from(find.is_some());
-            self.review += usize::from(find.is_some_and(|f| f.verdict == Verdict::Review));
-            if !hit {
-                let side_px = (label.high[0] - label.low[0]).max(label.high[1] - label.low[1]);
-                list(&mut self.misses, || {
-                    Miss::new(file, label.center(), side_px, vec![scene.into()], find)
-                });
-            }
-        }
-        for find in found.screws.iter().filter(|f| f.verdict == Verdict::Screw) {
-            if labels.iter().any(|l| l.cross && l.holds(find)) {
-                continue;
-            }
-            let hex = labels.iter().any(|l| l.holds(find));
-            false_finds += 1;
-            self.hex_called_screw += usize::from(hex);
-            let kind = if hex { "hex" } else { "background" };
-            list(&mut self.false_list, || FalseFind::new(file, find, kind));
-        }
-        self.false_finds += false_finds;
-        self.scenes.entry(scene.into()).or_default().push((share, false_finds));
-    }
-
-    fn finish(self, source: String, model: &str, head_px: [f64; 2]) -> PhotoEvaluation {
-        let row = |photos: &Vec<(Share, usize)>| {
-            let shares: Vec<f64> = photos.iter().filter_map(|(s, _)| s.rate().rate).collect();
-            SceneRow {
-                photos: photos.len(),
-                distinct: photos.iter().map(|(s, _)| s.of).max().unwrap_or(0),
-                found: (!shares.is_empty()).then(|| shares.iter().sum::<f64>() / shares.len() as f64),
-                false_finds_mean: photos.iter().map(|(_, f)| *f as f64).sum::<f64>() / photos.len().max(1) as f64,
-            }
-        };
-        let scenes: BTreeMap<String, SceneRow> = self.scenes.iter().map(|(name, p)| (name.clone(), row(p))).collect();
-        let distinct: usize = scenes.values().map(|s| s.distinct).sum();
-        let found: f64 = scenes.values().filter_map(|s| Some(s.found? * s.distinct as f64)).sum();
-        let share = (distinct > 0).then(|| found / distinct as f64);
-        let bounds = share.map_or((0.0, 1.0), |p| wilson_share(p, distinct as f64));
-        let n = self.photos.max(1) as f64;
-        PhotoEvaluation {
-            source,
-            model: model.to_owned(),
-            head_px,
-            photos: self.photos,
-            distinct,
-            recall_distinct: share,
-            recall_distinct_bounds: bounds.into(),
-            recall: self.recall.rate(),
-            recall_or_review: Rate::of(self.recall.hits + self.review, self.recall.of),
-            recall_any: Rate::of(self.any, self.recall.of),
-            false_finds: self.false_finds,
-            false_finds_mean: self.false_finds as f64 / n,
-            hex_called_screw: self.hex_called_screw,
-            hexagons: self.hexagons,
-            drives: self.drives,
-            scenes,
-            misses: self.misses,
-            false_list: self.false_list,
-            total_ms: self.total_ms / n,
-        }
-    }
-}
-
-/// Stage 2 on real crops of held-out groups: a fastener of any drive, against holes and everything else.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
-pub struct CropEvaluation {
-    /// Screws of any drive that were called a fastener.
-    pub fasteners: Rate,
-    /// Holes and other things that were not.
-    pub others: Rate,
-    /// Mean of the two.
-    pub balanced_accuracy: f64,
-}
-
-/// Measures stage 2 on the held-out crops of the training data's folder.
-///
-/// # Errors
-/// An [`EvaluateError`] that names the file.
-pub fn evaluate_crops(detector: &Detector, data: &Path) -> Result<CropEvaluation, EvaluateError> {
-    let mut rng = Pcg64Mcg::seed_from_u64(1);
-    let (mut fasteners, mut others) = (Share::default(), Share::default());
-    for patch in real::crops(data, true, &mut rng)? {
-        let side = PATCH_PX as u32;
-        let (Some(label), Some(picture)) = (patch.labels.first(), RgbImage::from_raw(side, side, patch.rgb.clone()))
-        else {
-            continue;
-        };
-        let place = Pixel::new(f64::from(label.u_px), f64::from(label.v_px));
-        let evidence = look(&detector.model().fine, &picture, &[place]);
-        let called = evidence.iter().any(|e| e.fastener() >= 0.5);
-        if label.classes == any_fastener() {
-            fasteners.add(called);
-        } else {
-            others.add(!called);
-        }
-    }
-    let (fasteners, others) = (fasteners.rate(), others.rate());
-    Ok(CropEvaluation {
-        fasteners,
-        others,
-        balanced_accuracy: 0.5 * (fasteners.rate.unwrap_or(0.0) + others.rate.unwrap_or(0.0)),
-    })
-}
-
-/// A name cut to fit its column.
-fn cut(text: &str, width: usize) -> String {
-    match text.char_indices().nth(width) {
-        None => text.to_owned(),
-        Some(_) => text.chars().take(width - 1).chain(['~']).collect(),
-    }
-}
-
-/// As in the tables: `98.7`, or `-` of nothing.
-fn percent(share: Option<f64>, digits: usize) -> String {
-    share.map_or("-".into(), |s| format!("{:.digits$}", 100.0 * s))
-}
-
 fn write_rates(f: &mut Formatter<'_>, title: &str, rows: &BTreeMap<String, Rate>) -> fmt::Result {
     if rows.is_empty() {
         return Ok(());
@@ -1394,37 +723,6 @@ fn write_rates(f: &mut Formatter<'_>, title: &str, rows: &BTreeMap<String, Rate>
             "  {name:<20} {:>6} {:>6} {share:>9}   {low:.1} to {high:.1}",
             rate.of, rate.hits
         )?;
-    }
-    Ok(())
-}
-
-fn write_lists(f: &mut Formatter<'_>, misses: &[Miss], false_list: &[FalseFind]) -> fmt::Result {
-    if !misses.is_empty() {
-        writeln!(f, "\nnot found")?;
-    }
-    for miss in misses.iter().take(PRINTED) {
-        let called = match miss.score {
-            Some(score) => format!("{} {score:.2}", miss.called),
-            None if miss.candidate == Some(false) => "nothing (stage 1)".into(),
-            None => miss.called.clone(),
-        };
-        let (picture, tags) = (cut(&miss.picture, 20), cut(&miss.tags.join(" "), 28));
-        let (u, v, d) = (miss.u_px, miss.v_px, miss.head_d_px);
-        writeln!(f, "  {picture:<20} {u:7.1} {v:7.1}  head {d:5.1}  {called:<17}  {tags}")?;
-    }
-    if !false_list.is_empty() {
-        writeln!(f, "\nfalse finds")?;
-    }
-    for find in false_list.iter().take(PRINTED) {
-        let (picture, kind) = (cut(&find.picture, 20), &find.kind);
-        writeln!(
-            f,
-            "  {picture:<20} {:7.1} {:7.1}  score {:.3}  {kind}",
-            find.u_px, find.v_px, find.score
-        )?;
-    }
-    if misses.len() > PRINTED || false_list.len() > PRINTED {
-        writeln!(f, "  (the first {PRINTED} of each; the JSON has the first {LISTED})")?;
     }
     Ok(())
 }
@@ -1540,93 +838,10 @@ impl Display for Evaluation {
     }
 }
 
-impl Display for PhotoEvaluation {
-    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
-        writeln!(f, "model        {}", self.model)?;
-        writeln!(f, "measured on  {} {}", self.photos, self.source)?;
-        writeln!(f, "heads        {} to {} px", self.head_px[0], self.head_px[1])?;
-        match self.recall_distinct {
-            Some(recall) => writeln!(
-                f,
-                "recall     {:6.2} %  (of {} distinct cross screws; 95 %: {:.1} to {:.1} %)",
-                100.0 * recall,
-                self.distinct,
-                100.0 * self.recall_distinct_bounds[0],
-                100.0 * self.recall_distinct_bounds[1]
-            )?,
-            None => writeln!(f, "recall          -    (no cross screws)")?,
-        }
-        writeln!(f, "of labels  {}", self.recall)?;
-        writeln!(f, "  + review {}", self.recall_or_review)?;
-        writeln!(f, "  any      {}", self.recall_any)?;
-        writeln!(
-            f,
-            "false        {} finds, {:.2} a photograph; {} of them on one of {} hexagons",
-            self.false_finds, self.false_finds_mean, self.hex_called_screw, self.hexagons
-        )?;
-        if !self.drives.is_empty() {
-            writeln!(f, "\nlabel    drive it was given")?;
-        }
-        for (label, drives) in &self.drives {
-            let drives: Vec<String> = drives.iter().map(|(drive, n)| format!("{drive} {n}")).collect();
-            writeln!(f, "  {label:<6} {}", drives.join(", "))?;
-        }
-        let [photos, distinct, found, false_finds] = ["photos", "distinct", "found %", "false a photo"];
-        writeln!(
-            f,
-            "\n{:<22} {photos:>6} {distinct:>9} {found:>9} {false_finds:>14}",
-            "scene"
-        )?;
-        for (name, s) in &self.scenes {
-            let (name, found) = (cut(name, 20), percent(s.found, 1));
-            writeln!(
-                f,
-                "  {name:<20} {:>6} {:>9} {found:>9} {:>14.2}",
-                s.photos, s.distinct, s.false_finds_mean
-            )?;
-        }
-        write_lists(f, &self.misses, &self.false_list)?;
-        writeln!(f, "\nmean time    {:.0} ms a photograph", self.total_ms)
-    }
-}
-
-impl Display for CropEvaluation {
-    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
-        writeln!(f, "fasteners of any drive  {}", self.fasteners)?;
-        writeln!(f, "holes and others        {}", self.others)?;
-        writeln!(f, "balanced accuracy       {:6.2} %", 100.0 * self.balanced_accuracy)
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    fn find(u_px: f64, v_px: f64, verdict: Verdict, drive: Drive) -> Screw {
-        Screw {
-            pixel: Pixel::new(u_px, v_px),
-            sigma_px: 0.5,
-            diameter_px: 30.0,
-            score: 0.9,
-            drive,
-            verdict,
-            cues: Vec::new(),
-            angle_rad: None,
-            camera: Some(Point::new(0.3, 0.4, 1501.2)),
-            normal: None,
-            sigma_lateral_mm: Some(0.1),
-            sigma_depth_mm: Some(1.0),
-        }
-    }
-
-    fn detections(screws: Vec<Screw>) -> Detections {
-        Detections {
-            screws,
-            timing_ms: Timing::default(),
-            model: "sha256:00".into(),
-            size_px: (1000, 1000),
-        }
-    }
+    use crate::evaluate::tests::{detections, find};
 
     fn screw(u_px: f64, detectable: bool, tag: &str) -> TrueScrew {
         TrueScrew {
@@ -1744,25 +959,6 @@ mod tests {
     }
 
     #[test]
-    fn bounds_of_the_paper_s_gauge() {
-        let (low, high) = wilson(3064, 3070);
-        assert_eq!([(low * 1e4).round(), (high * 1e4).round()], [9957.0, 9991.0]);
-        assert_eq!(wilson(0, 0), (0.0, 1.0));
-        assert!(wilson(5, 5).1 > 0.999_999 && wilson(5, 5).0 < 0.6 && wilson(0, 5).0 < 1e-12);
-    }
-
-    #[test]
-    fn quantiles_and_coverage() {
-        let errors: Vec<f64> = (0..=100).rev().map(f64::from).collect();
-        let q = Quantiles::of(&errors).expect("not empty");
-        assert_eq!((q.n, q.median, q.p95, q.p99, q.max), (101, 50.0, 95.0, 99.0, 100.0));
-        assert_eq!(Quantiles::of(&[1.0, 2.0]).map(|q| q.median), Some(1.5));
-        assert_eq!(Quantiles::of(&[]), None);
-        let c = Coverage::of(&[0.5, -0.9, 1.5, -1.95, 3.0, f64::NAN]);
-        assert_eq!((c.one_sigma.hits, c.two_sigma.hits, c.two_sigma.of), (2, 4, 6));
-    }
-
-    #[test]
     fn seeds_of_training_are_refused() {
         let detector = Detector::embedded().expect("the built-in model");
         let seeds = 999_999..1_000_001;
@@ -1841,52 +1037,5 @@ mod tests {
         std::fs::remove_file(&json).expect("was there");
         let none = truth_files(&folder.0).expect_err("no truth there");
         assert!(matches!(none, EvaluateError::Nothing { .. }), "{none}");
-    }
-
-    #[test]
-    fn photographs_are_counted_by_scene() {
-        let text = "1 0.1 0.1 0.05 0.05\n\n0 0.5 0.5 0.6 0.5 0.6 0.6 0.5 0.6\n";
-        let labels = parse_labels(text, (1000, 1000)).expect("a box and a polygon");
-        let near = |a: [f64; 2], b: f64| a.iter().all(|a| (a - b).abs() < 1e-9);
-        assert!(labels[0].cross && near(labels[0].low, 74.5) && near(labels[0].high, 124.5));
-        assert!(!labels[1].cross && near(labels[1].low, 499.5) && near(labels[1].high, 599.5));
-        assert!(parse_labels("2 0 0 1 1", (9, 9)).is_err() && parse_labels("1 0 0 1", (9, 9)).is_err());
-
-        let acted = |at: f64| find(at, at, Verdict::Screw, Drive::Cross);
-        let mut tally = PhotoTally::default();
-        tally.add("a", "one", &labels, &detections(vec![acted(100.0), acted(550.0)]));
-        let bolt = find(550.0, 550.0, Verdict::Other, Drive::HexHead);
-        tally.add("b", "one", &labels, &detections(vec![bolt]));
-        let second = Label {
-            cross: true,
-            low: [200.0; 2],
-            high: [230.0; 2],
-        };
-        let finds = vec![acted(100.0), acted(216.0), acted(800.0)];
-        tally.add("c", "two", &[labels[0], second], &detections(finds));
-        let e = tally.finish("x".into(), "sha256:00", [15.0, 80.0]);
-        assert_eq!((e.distinct, e.photos, e.hexagons), (3, 3, 2));
-        // scene one: half of one screw; scene two: both of two
-        assert!((e.recall_distinct.expect("screws") - 2.5 / 3.0).abs() < 1e-12, "{e:?}");
-        assert_eq!((e.recall.hits, e.recall.of), (3, 4));
-        assert_eq!(
-            (e.false_finds, e.hex_called_screw, e.false_finds_mean),
-            (2, 1, 2.0 / 3.0)
-        );
-        assert_eq!((e.drives["hex"]["cross"], e.drives["hex"]["hex_head"]), (1, 1));
-        assert_eq!(e.drives["cross"]["cross"], 3);
-        assert!(e.to_string().lines().all(|l| l.chars().count() <= 100), "{e}");
-
-        // a centre outside the box: a good overlap serves, too little of one does not
-        let at = |u_px: f64| find(u_px, 215.0, Verdict::Screw, Drive::Cross);
-        assert!(second.holds(&at(199.0)) && !second.holds(&at(192.0)));
-    }
-
-    #[test]
-    fn manifests() {
-        let rows = parse_manifest("scene,file,n\ns1,a.jpg,3\n\ns2,b.jpg,4\n").expect("two rows");
-        assert_eq!(rows[1], ("b.jpg".into(), "s2".into()));
-        assert!(parse_manifest("file,n\n").is_err_and(|e| e.contains("scene")));
-        assert!(parse_manifest("file,scene\na,b,c\n").is_err_and(|e| e.contains("line 2")));
     }
 }

@@ -1,0 +1,32 @@
+//! The rendered face that a seed stands for: what tuning and evaluation look at.
+
+use geometry::RgbdFrame;
+use scene::{FaceId, FaceTruth, FaceView, Prepared, Unit};
+
+/// A face of a product, as the cell's camera sees it, with everything that is on it.
+pub struct Shot {
+    /// Colour, depth and camera.
+    pub frame: RgbdFrame,
+    /// What is on it.
+    pub truth: FaceTruth,
+}
+
+/// The face of an outdoor unit that a seed stands for.
+pub fn face_of(seed: u64) -> FaceId {
+    FaceId::ALL[(seed % FaceId::ALL.len() as u64) as usize]
+}
+
+/// Renders a face; `None` where the product does not have it.
+pub fn shot(product: &Unit, face: FaceId, seed: u64) -> Option<Shot> {
+    let view = FaceView::sample(product, face, seed)?;
+    let prepared = Prepared::new(&view);
+    let truth = prepared.truth();
+    let picture = prepared.render(None);
+    let frame = RgbdFrame {
+        color: picture.color,
+        depth: Some(picture.depth),
+        camera: Some(view.camera),
+        t_s: 0.0,
+    };
+    Some(Shot { frame, truth })
+}
