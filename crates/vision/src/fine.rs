@@ -23,29 +23,58 @@ const CELLS_A_VOTE: f64 = 4.0;
 /// Clips that go through the networks at once: bounds the memory.
 const BATCH: usize = 64;
 
+/// From this probability of a fastener on, a clip is also looked at mirrored: the networks' errors differ, their mean is better.
+const WORTH_MIRRORS: f32 = 0.03;
+/// The mirror images beside the clip as it is: signs along u and v.
+const MIRRORS: [[i64; 2]; 3] = [[-1, 1], [1, -1], [-1, -1]];
+
 /// A square of the picture around a candidate; outside the picture its border is repeated.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Clip {
-    corner: [i64; 2],
+    /// Picture pixel under clip pixel [`CLIP_CENTER_PX`].
+    middle: [i64; 2],
+    /// Picture pixels per clip pixel along each axis: 1, or -1 where mirrored.
+    sign: [i64; 2],
     rgb: Vec<u8>,
 }
 
 impl Clip {
     /// Cuts a clip of [`CLIP_PX`] a side such that `center`, rounded, is its pixel [`CLIP_CENTER_PX`].
     pub fn cut(picture: &RgbImage, center: Pixel<space::Clip>) -> Self {
-        let corner = [center.u_px, center.v_px].map(|c| c.round() as i64 - CLIP_CENTER_PX as i64);
+        Self::mirrored(picture, center, [1, 1])
+    }
+
+    /// As [`cut`](Self::cut), mirrored about that pixel along the axes whose sign is -1.
+    fn mirrored(picture: &RgbImage, center: Pixel<space::Clip>, sign: [i64; 2]) -> Self {
+        let middle = [center.u_px, center.v_px].map(|c| c.round() as i64);
         let (width, height) = (i64::from(picture.width()), i64::from(picture.height()));
         let mut rgb = Vec::with_capacity(CLIP_PX * CLIP_PX * 3);
         let raw = picture.as_raw();
+        let source = |axis: usize, c: i64, size: i64| {
+            (middle[axis] + sign[axis] * (c - CLIP_CENTER_PX as i64)).clamp(0, size - 1)
+        };
         for y in 0..CLIP_PX as i64 {
-            let v = (corner[1] + y).clamp(0, height - 1);
+            let v = source(1, y, height);
             for x in 0..CLIP_PX as i64 {
-                let u = (corner[0] + x).clamp(0, width - 1);
-                let at = 3 * (v * width + u) as usize;
+                let at = 3 * (v * width + source(0, x, width)) as usize;
                 rgb.extend_from_slice(&raw[at..at + 3]);
             }
         }
-        Self { corner, rgb }
+        Self { middle, sign, rgb }
+    }
+
+    /// Where a place of the picture lies in the clip.
+    fn to_clip(&self, place: Pixel<space::Clip>) -> [f64; 2] {
+        let along =
+            |axis: usize, c: f64| CLIP_CENTER_PX as f64 + self.sign[axis] as f64 * (c - self.middle[axis] as f64);
+        [along(0, place.u_px), along(1, place.v_px)]
+    }
+
+    /// Where a place of the clip lies in the picture.
+    fn to_picture(&self, place: Pixel<space::Clip>) -> Pixel<space::Clip> {
+        let along =
+            |axis: usize, c: f64| self.middle[axis] as f64 + self.sign[axis] as f64 * (c - CLIP_CENTER_PX as f64);
+        Pixel::new(along(0, place.u_px), along(1, place.v_px))
     }
 
     /// The exponent that brings the clip's median luminance to 0.45, between 0.4 and 2.5.
@@ -102,7 +131,8 @@ impl Evidence {
     }
 }
 
-/// Runs the ensemble on clips around the places, and once more where the voted centre lies far from the middle.
+/// Runs the ensemble on clips around the places, once more where the voted centre lies far from the middle, and on the mirror
+/// images of what may be a fastener.
 ///
 /// # Arguments
 /// * `networks` – the mean of their answers decides; one network is an ensemble too.
@@ -113,21 +143,46 @@ pub fn look(networks: &[Network], picture: &RgbImage, places: &[Pixel<space::Cli
     if picture.width() == 0 || picture.height() == 0 {
         return Vec::new();
     }
-    let mut evidence = look_once(networks, picture, places);
+    let mut evidence = look_once(networks, picture, places, [1, 1]);
     let again: Vec<usize> = (0..places.len())
         .filter(|&i| evidence[i].center.distance_px(&places[i]) > RECENTER_PX && evidence[i].fastener() > 0.01)
         .collect();
     let centers: Vec<_> = again.iter().map(|&i| evidence[i].center).collect();
-    for (&i, second) in again.iter().zip(look_once(networks, picture, &centers)) {
+    for (&i, second) in again.iter().zip(look_once(networks, picture, &centers, [1, 1])) {
         evidence[i] = second;
+    }
+    let worth: Vec<usize> = (0..evidence.len())
+        .filter(|&i| evidence[i].fastener() >= WORTH_MIRRORS)
+        .collect();
+    let centers: Vec<_> = worth.iter().map(|&i| evidence[i].center).collect();
+    let views = MIRRORS.map(|sign| look_once(networks, picture, &centers, sign));
+    for (k, &i) in worth.iter().enumerate() {
+        // a mirror image may have settled on a neighbour
+        let same = |e: &&Evidence| e.center.distance_px(&centers[k]) < VOTE_RADIUS * evidence[i].diameter_px;
+        let mirrored = views.iter().map(|view| &view[k]).filter(same);
+        evidence[i] = mean(&std::iter::once(&evidence[i]).chain(mirrored).collect::<Vec<_>>());
     }
     evidence
 }
 
-fn look_once(networks: &[Network], picture: &RgbImage, places: &[Pixel<space::Clip>]) -> Vec<Evidence> {
+/// What several looks at one thing say together.
+fn mean(looks: &[&Evidence]) -> Evidence {
+    let share = 1.0 / looks.len() as f64;
+    let over = |value: &dyn Fn(&Evidence) -> f64| share * looks.iter().map(|e| value(e)).sum::<f64>();
+    let center = Pixel::new(over(&|e| e.center.u_px), over(&|e| e.center.v_px));
+    let spread = over(&|e| 0.5 * e.center.distance_px(&center).powi(2));
+    Evidence {
+        center,
+        sigma_px: (share * (over(&|e| e.sigma_px.powi(2)) + spread)).sqrt(),
+        diameter_px: over(&|e| e.diameter_px.ln()).exp(),
+        probability: std::array::from_fn(|c| over(&|e| f64::from(e.probability[c])) as f32),
+    }
+}
+
+fn look_once(networks: &[Network], picture: &RgbImage, places: &[Pixel<space::Clip>], sign: [i64; 2]) -> Vec<Evidence> {
     let mut evidence = Vec::with_capacity(places.len());
     for places in places.chunks(BATCH) {
-        let clips: Vec<Clip> = places.iter().map(|&p| Clip::cut(picture, p)).collect();
+        let clips: Vec<Clip> = places.iter().map(|&p| Clip::mirrored(picture, p, sign)).collect();
         let mut batch = Tensor::zeros(clips.len(), CLIP_PX, CLIP_PX, 3);
         batch
             .data
@@ -142,16 +197,16 @@ fn look_once(networks: &[Network], picture: &RgbImage, places: &[Pixel<space::Cl
                 map
             })
             .collect();
-        evidence.par_extend(clips.par_iter().zip(places).enumerate().map(|(n, (clip, place))| {
+        evidence.par_extend(clips.par_iter().zip(places).enumerate().map(|(n, (clip, &place))| {
             let maps: Vec<&[f32]> = maps
                 .iter()
                 .map(|map| &map.data[map.index(n, 0, 0)..][..MAP_CELLS * MAP_CELLS * FINE_CHANNELS])
                 .collect();
-            let start = [place.u_px - clip.corner[0] as f64, place.v_px - clip.corner[1] as f64];
-            let mut evidence = judge(&maps, start);
-            evidence.center.u_px += clip.corner[0] as f64;
-            evidence.center.v_px += clip.corner[1] as f64;
-            evidence
+            let evidence = judge(&maps, clip.to_clip(place));
+            Evidence {
+                center: clip.to_picture(evidence.center),
+                ..evidence
+            }
         }));
     }
     evidence
@@ -335,6 +390,23 @@ mod tests {
             evidence.center.distance_px(&Pixel::new(30.0, 32.0)) < 0.1,
             "{evidence:?}"
         );
+    }
+
+    #[test]
+    fn a_mirrored_clip_shows_the_same_place() {
+        let picture = RgbImage::from_fn(120, 100, |x, y| image::Rgb([x as u8, y as u8, 0]));
+        let center = Pixel::new(61.4, 47.8);
+        for sign in [[1, 1], [-1, 1], [1, -1], [-1, -1]] {
+            let clip = Clip::mirrored(&picture, center, sign);
+            let at = clip.to_clip(center);
+            assert!((at[0] - 32.0).hypot(at[1] - 32.0) < 0.75);
+            assert!(clip.to_picture(Pixel::new(at[0], at[1])).distance_px(&center) < 1e-9);
+            for (x, y) in [(3, 5), (32, 32), (60, 11)] {
+                let there = clip.to_picture(Pixel::new(f64::from(x), f64::from(y)));
+                let at = 3 * (y as usize * CLIP_PX + x as usize);
+                assert_eq!([clip.rgb[at], clip.rgb[at + 1]], [there.u_px as u8, there.v_px as u8]);
+            }
+        }
     }
 
     #[test]
