@@ -126,7 +126,7 @@ pub fn run(args: &Args) -> Result<Ended> {
             {
                 return Ok(Ended::Good);
             }
-            eprintln!("unscrew: {error:#}");
+            eprintln!("unscrew: {}", output::with_causes(&error));
             failed += 1;
         }
     }

@@ -72,7 +72,7 @@ fn main() -> ExitCode {
         Ok(Ended::Good) => ExitCode::SUCCESS,
         Ok(Ended::NotGoodEnough) => ExitCode::from(3),
         Err(error) => {
-            eprintln!("unscrew: {error:#}");
+            eprintln!("unscrew: {}", output::with_causes(&error));
             ExitCode::from(1)
         }
     }

@@ -66,3 +66,16 @@ pub fn write_json(path: &Path, value: &impl serde::Serialize) -> Result<()> {
     geometry::write_aside(path, &text)?;
     Ok(())
 }
+
+/// An error with its causes, each said once: libraries name the system's reason in their own message already.
+pub fn with_causes(error: &anyhow::Error) -> String {
+    let mut text = String::new();
+    for cause in error.chain().map(ToString::to_string) {
+        if text.is_empty() {
+            text = cause;
+        } else if !text.contains(&cause) {
+            text = format!("{text}: {cause}");
+        }
+    }
+    text
+}

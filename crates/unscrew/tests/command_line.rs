@@ -21,6 +21,8 @@ fn refused(folder: &Path, args: &[&str], words: &[&str]) {
     let text = String::from_utf8_lossy(&output.stderr).into_owned();
     assert_eq!(output.status.code(), Some(1), "{args:?}: {text}");
     assert!(!text.contains("panicked"), "{args:?}: {text}");
+    let reason = "(os error 2)";
+    assert!(text.matches(reason).count() <= 1, "the reason is said twice: {text}");
     for word in words {
         assert!(text.contains(word), "{args:?}: '{word}' is not in: {text}");
     }
