@@ -7,10 +7,14 @@ use std::path::PathBuf;
 use training::{Progress, TrainSettings, try_network};
 use vision::layout::{CLIP_PX, FINE_CHANNELS, fine_spec};
 
-struct Quiet;
+struct Loss;
 
-impl Progress for Quiet {
-    fn report(&self, _: &str, _: u64, _: u64, _: Option<f32>) {}
+impl Progress for Loss {
+    fn report(&self, _: &str, done: u64, _: u64, loss: Option<f32>) {
+        if done % 250 == 0 {
+            eprintln!("{done} {loss:?}");
+        }
+    }
 }
 
 /// Kernel side, stride, dilation, channels of each layer before the output.
@@ -24,6 +28,20 @@ fn network(layers: &[[usize; 4]]) -> Spec {
         relu: true,
     };
     let mut layers: Vec<LayerSpec> = layers.iter().map(conv).collect();
+    if layers
+        .iter()
+        .map(|l| {
+            if matches!(l, LayerSpec::Conv { stride: 2, .. }) {
+                2
+            } else {
+                1
+            }
+        })
+        .product::<usize>()
+        == 8
+    {
+        layers.push(LayerSpec::Upsample2);
+    }
     layers.push(LayerSpec::Conv {
         kernel: 1,
         stride: 1,
@@ -60,6 +78,17 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
                 [3, 1, 1, 48],
                 [3, 1, 2, 48],
                 [3, 1, 2, 48],
+            ]),
+        ),
+        (
+            "eighth",
+            network(&[
+                [3, 2, 1, 32],
+                [3, 2, 1, 64],
+                [3, 2, 1, 128],
+                [3, 1, 1, 128],
+                [3, 1, 1, 128],
+                [3, 1, 1, 128],
             ]),
         ),
         (
@@ -103,7 +132,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             continue;
         }
         let (parameters, flops) = (spec.parameters(), spec.flops(CLIP_PX, CLIP_PX) as f64 / 1e6);
-        let t = try_network(spec, &settings, 40, &Quiet)?;
+        let t = try_network(spec, &settings, 40, &Loss)?;
         println!(
             "{name:8} {parameters:10} {flops:6.1} {:8.0} {:6.3} {:7.4} {:9.4} {:6.3} {:7.3} {:.3}   ({} screws, {} others)",
             t.train_s, t.loss, t.recall, t.log_loss, t.drive_right, t.center_px[0], t.center_px[1], t.screws, t.others

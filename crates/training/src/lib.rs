@@ -19,6 +19,7 @@ pub use evaluate::{
 };
 pub use geometry::{Rate, wilson};
 pub use train::{
-    Progress, TRAINING_SEEDS, TUNING_SEEDS, TrainError, TrainReport, TrainSettings, Trial, train, try_network,
+    Progress, TRAINING_SEEDS, TUNING_SEEDS, TrainError, TrainReport, TrainSettings, Trial, measure_networks, train,
+    try_network,
 };
 pub use tune::Tuning;

@@ -5,7 +5,7 @@ use crate::real;
 use crate::samples::{PATCH_PX, Patch, any_fastener, only, rendered};
 use crate::tune::{self, Tuning};
 use geometry::{Pixel, RgbImage};
-use nn::{Spec, Tensor, Trainer};
+use nn::{Network, Spec, Tensor, Trainer};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use serde::Serialize;
@@ -503,12 +503,32 @@ pub fn try_network(
         &mut losses,
     )?;
     let train_s = begin.elapsed().as_secs_f64();
-    let networks = [trainer.network()];
     let first = TUNING_SEEDS.start + 100_000;
     let unseen = rendered(first..first + units, settings.background, work, &|_| {})?;
+    Ok(Trial {
+        loss: losses.get("trial").copied().unwrap_or(f32::NAN),
+        train_s,
+        ..judged(&[trainer.network()], &unseen)
+    })
+}
+
+/// What networks of stage 2 say of the patches of units, for instance to compare those that they learned from with others.
+///
+/// # Errors
+/// As [`train`], for the work folder.
+pub fn measure_networks(
+    networks: &[Network],
+    units: Range<u64>,
+    settings: &TrainSettings,
+) -> Result<Trial, TrainError> {
+    let patches = rendered(units, settings.background, settings.work.as_deref(), &|_| {})?;
+    Ok(judged(networks, &patches))
+}
+
+fn judged(networks: &[Network], patches: &[Patch]) -> Trial {
     let (mut screws, mut others, mut errors) = (Vec::new(), Vec::new(), Vec::new());
     let (mut drives, mut right) = (0, 0);
-    for patch in &unseen {
+    for patch in patches {
         let Some(picture) = RgbImage::from_raw(PATCH_PX as u32, PATCH_PX as u32, patch.rgb.clone()) else {
             continue;
         };
@@ -516,7 +536,7 @@ pub fn try_network(
         let middle = PATCH_PX as f64 / 2.0;
         // stage 1 is off by a few pixels
         let place = label.map_or([middle; 2], |l| [f64::from(l.u_px) + 2.0, f64::from(l.v_px) - 2.0]);
-        let Some(found) = vision::look(&networks, &picture, &[Pixel::new(place[0], place[1])]).pop() else {
+        let Some(found) = vision::look(networks, &picture, &[Pixel::new(place[0], place[1])]).pop() else {
             continue;
         };
         let score = f64::from(found.of(Class::Cross));
@@ -550,14 +570,14 @@ pub fn try_network(
     let part = |hits: usize, of: usize| hits as f64 / of.max(1) as f64;
     let sure = |p: &f64| -p.max(1e-6).ln();
     let log_loss = screws.iter().map(sure).sum::<f64>() + others.iter().map(|p| sure(&(1.0 - p))).sum::<f64>();
-    Ok(Trial {
-        loss: losses.get("trial").copied().unwrap_or(f32::NAN),
-        train_s,
+    Trial {
+        loss: f32::NAN,
+        train_s: 0.0,
         screws: screws.len(),
         others: others.len(),
         recall: part(screws.iter().filter(|s| **s > limit).count(), screws.len()),
         log_loss: log_loss / (screws.len() + others.len()).max(1) as f64,
         drive_right: part(right, drives),
         center_px: [at(&errors, 0.5), at(&errors, 0.95)],
-    })
+    }
 }
