@@ -18,8 +18,8 @@ const ENOUGH: usize = 20;
 const MISS: f64 = 1.0;
 /// Cost of something taken for a screw: the bit goes where it must not.
 const FALSE_FIND: f64 = 3.0;
-/// Cost of a look by a person: unattended, the unit is excluded for it.
-const LOOK: f64 = 0.4;
+/// Cost of a look by a person: unattended, the unit is excluded for it, so it is nearly as bad as a miss.
+const LOOK: f64 = 0.6;
 
 /// What was chosen, and by which figures.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]

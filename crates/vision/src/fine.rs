@@ -24,7 +24,7 @@ const CELLS_A_VOTE: f64 = 4.0;
 const BATCH: usize = 64;
 
 /// From this probability of a fastener on, a clip is also looked at mirrored: the networks' errors differ, their mean is better.
-const WORTH_MIRRORS: f32 = 0.03;
+const WORTH_MIRRORS: f32 = 0.1;
 /// The mirror images beside the clip as it is: signs along u and v.
 const MIRRORS: [[i64; 2]; 3] = [[-1, 1], [1, -1], [-1, -1]];
 
