@@ -11,7 +11,7 @@ struct Loss;
 
 impl Progress for Loss {
     fn report(&self, _: &str, done: u64, _: u64, loss: Option<f32>) {
-        if done % 250 == 0 {
+        if done.is_multiple_of(250) {
             eprintln!("{done} {loss:?}");
         }
     }
