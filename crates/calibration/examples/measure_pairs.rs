@@ -35,6 +35,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         ("affine", Method::Affine, false),
         ("lattice, as published", Method::Lattice, true),
         ("lattice, robust", Method::Lattice, false),
+        ("gp", Method::Gp, false),
     ];
     for (name, method, as_published) in cases {
         let settings = Settings {
@@ -77,7 +78,7 @@ fn main() -> Result<(), Box<dyn Error>> {
             inside.last().copied().unwrap_or_default(),
             over(&inside),
         );
-        if name == "lattice, robust" {
+        if name == "gp" {
             println!("\n{report}");
         }
     }

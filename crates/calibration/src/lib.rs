@@ -41,12 +41,14 @@
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
 
+mod gp;
 mod lattice;
 mod map;
 mod pair;
 mod plan;
 mod report;
 mod rigid;
+mod ripple;
 
 pub use lattice::Level;
 pub use map::{Hull, Identity, Map, MapError, MappedPoint, Method, Settings, camera_identity};

@@ -2,9 +2,10 @@
 
 use crate::{
     Figures, FitError, FitReport, Level, Pair, Rejected, Volume,
+    gp::{self, Choice, Gp},
     lattice::{Estimate, Grid, LEVELS, MAX_LEVERAGE, Model, Shape, believable, split},
     pair,
-    rigid::{self, quantile},
+    rigid::{self, Points, quantile},
 };
 use geometry::{Base, Camera, CameraModel, Point, Transform};
 use nalgebra::Vector3;
@@ -21,8 +22,11 @@ pub enum Method {
     /// One affine map: the paper's global linear map alone.
     Affine,
     /// The paper's Algorithm 2: global map, then second order among the 27 points around.
-    #[default]
     Lattice,
+    /// A Gaussian process of what the rigid motion leaves, and the ripple of the gears where the pairs have joint angles of a
+    /// GP25: 100 points do as well as thousands do for the others.
+    #[default]
+    Gp,
 }
 
 impl Method {
@@ -32,6 +36,7 @@ impl Method {
             Self::Rigid => "rigid",
             Self::Affine => "affine",
             Self::Lattice => "lattice",
+            Self::Gp => "gp",
         }
     }
 
@@ -40,7 +45,7 @@ impl Method {
         match self {
             Self::Rigid => 5,
             Self::Affine => 8,
-            Self::Lattice => 20,
+            Self::Lattice | Self::Gp => 20,
         }
     }
 }
@@ -152,16 +157,17 @@ pub enum MapError {
 }
 
 const FORMAT: &str = "unscrew-map";
-const VERSION: u64 = 1;
+const VERSION: u64 = 2;
 
 /// Standard deviation of one measurement about the map for each level of the fallback: across the ray and along it, mm.
 type Scales = [[f64; 2]; 4];
 
 /// A map from camera to base.
-#[derive(Clone, Debug)]
+#[derive(Clone)]
 pub struct Map {
     file: MapFile,
     model: Model,
+    gp: Option<Gp>,
 }
 
 /// What is written: the points that the map rests on; everything else follows from them.
@@ -177,6 +183,9 @@ struct MapFile {
     base_from_camera: Transform<Base, Camera>,
     volume: Volume,
     scales_mm: Scales,
+    /// What a Gaussian process rests on beside the points.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    gp: Option<Choice>,
     grid: Grid,
     points: Vec<Support>,
 }
@@ -187,6 +196,18 @@ struct Support {
     id: u64,
     camera: Point<Camera>,
     command: Point<Base>,
+    /// J1 to J3.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    joints_rad: Option<[f64; 3]>,
+}
+
+impl std::fmt::Debug for Map {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let mut out = f.debug_struct("Map");
+        out.field("settings", &self.file.settings)
+            .field("points", &self.file.points.len())
+            .finish_non_exhaustive()
+    }
 }
 
 impl Map {
@@ -200,10 +221,14 @@ impl Map {
         let motion = rigid::robust_rigid(&points)?;
         let nodes: Vec<_> = points.index.iter().map(|&i| pairs[i].node).collect();
         let grid = Grid::over(&nodes, &points.command);
-        let keep = if settings.as_published {
+        let mut keep = if settings.as_published {
             vec![true; points.index.len()]
         } else {
             believable(&points, &motion, &grid)
+        };
+        let fitted = match method {
+            Method::Gp => Some(gaussian(pairs, &points, &mut keep)?),
+            _ => None,
         };
         let used: Vec<usize> = (0..keep.len()).filter(|&i| keep[i]).collect();
         if used.len() < method.fewest_pairs() {
@@ -219,11 +244,16 @@ impl Map {
 
         let ray = |i: usize| model.ray(camera[i]);
         let held: Vec<Estimate> = model.leave_one_out(&camera, &command);
-        let errors: Vec<_> = held
-            .iter()
-            .enumerate()
-            .map(|(i, e)| (e.base - command[i], ray(i)))
-            .collect();
+        let errors: Vec<_> = match &fitted {
+            Some(fitted) => fitted
+                .choice
+                .points
+                .iter()
+                .zip(&fitted.left_out)
+                .map(|(&i, e)| (*e, ray(i)))
+                .collect(),
+            None => (0..).zip(&held).map(|(i, e)| (e.base - command[i], ray(i))).collect(),
+        };
         let rigid_errors: Vec<_> = (0..used.len())
             .map(|i| {
                 (
@@ -235,7 +265,11 @@ impl Map {
         let mut rejected: Vec<Rejected> = (0..keep.len())
             .filter(|&i| !keep[i])
             .map(|i| {
-                let error = points.command[i] - model.estimate(points.camera[i]).base;
+                let says = match &fitted {
+                    Some(fitted) => fitted.gp.at(points.camera[i]).base,
+                    None => model.estimate(points.camera[i]).base,
+                };
+                let error = points.command[i] - says;
                 let (lateral_mm, depth_mm) = split(error, -model.ray(points.camera[i]));
                 Rejected {
                     id: pairs[points.index[i]].id,
@@ -259,10 +293,15 @@ impl Map {
             notes: Vec::new(),
         };
         report.remark();
+        if let Some(ripple) = fitted.as_ref().and_then(|f| f.choice.ripple.as_ref()) {
+            report.notes.push(format!("ripple of the gears is taken out: {ripple}"));
+        }
+        let ripple = fitted.as_ref().is_some_and(|f| f.choice.ripple.is_some());
         let support = |(&i, (c, t)): (&usize, (&Vector3<f64>, &Vector3<f64>))| Support {
             id: pairs[points.index[i]].id,
             camera: Point::from_vector(*c),
             command: Point::from_vector(*t),
+            joints_rad: first_joints(&pairs[points.index[i]]).filter(|_| ripple),
         };
         let (low, high) = command
             .iter()
@@ -278,21 +317,34 @@ impl Map {
             base_from_camera: Transform::from_isometry(model.motion),
             volume: Volume::between(Point::from_vector(low), Point::from_vector(high)),
             scales_mm: scales(&model, &camera, &command, &held),
+            gp: fitted.as_ref().map(|f| f.choice.clone()),
             grid: model.grid.clone(),
             points: used.iter().zip(camera.iter().zip(&command)).map(support).collect(),
         };
-        Ok((Self { file, model }, report))
+        let gp = fitted.map(|f| f.gp);
+        Ok((Self { file, model, gp }, report))
     }
 
     /// Where a camera point is in the robot's base frame.
     pub fn apply(&self, camera: Point<Camera>) -> MappedPoint {
         let e = self.model.estimate(camera.vector());
+        // nothing measured supports a point outside or in a hole: its sigma grows with the distance
+        let beyond = 1.0 + e.outside.max(e.nearest.clamp(1.0, 2.0) - 1.0);
+        if let Some(gp) = &self.gp {
+            let answer = gp.at(camera.vector());
+            let [lateral, depth] = answer.sigma_mm;
+            return MappedPoint {
+                base: Point::from_vector(answer.base),
+                sigma_lateral_mm: lateral * beyond,
+                sigma_depth_mm: depth * beyond,
+                hull: self.hull(&e),
+            };
+        }
         let sigma = |component: usize| {
             let variance: f64 = (0..LEVELS.len())
                 .map(|l| self.file.scales_mm[l][component].powi(2) * (e.share[l] + e.variance[l]))
                 .sum();
-            // nothing measured supports a point outside or in a hole: its sigma grows with the distance
-            variance.sqrt() * (1.0 + e.outside.max(e.nearest.clamp(1.0, 2.0) - 1.0))
+            variance.sqrt() * beyond
         };
         MappedPoint {
             base: Point::from_vector(e.base),
@@ -361,7 +413,19 @@ impl Map {
         let camera: Vec<_> = file.points.iter().map(|p| p.camera.vector()).collect();
         let command: Vec<_> = file.points.iter().map(|p| p.command.vector()).collect();
         let model = Model::bake(shape(&file.settings), file.grid.clone(), &camera, &command);
-        Ok(Self { file, model })
+        let gp = match &file.gp {
+            Some(choice) => {
+                let points: Option<Vec<&Support>> = choice.points.iter().map(|&i| file.points.get(i)).collect();
+                let points = points.ok_or_else(|| bad("it rests on points that it does not hold".into()))?;
+                let camera: Vec<_> = points.iter().map(|p| p.camera.vector()).collect();
+                let command: Vec<_> = points.iter().map(|p| p.command.vector()).collect();
+                let joints: Option<Vec<_>> = points.iter().map(|p| p.joints_rad).collect();
+                let again = Gp::again(&camera, &command, joints.as_deref(), choice);
+                Some(again.ok_or_else(|| bad("its points do not determine it".into()))?)
+            }
+            None => None,
+        };
+        Ok(Self { file, model, gp })
     }
 
     /// Reads a map and makes sure that it belongs to this arm and this camera.
@@ -426,6 +490,49 @@ impl Map {
     pub(crate) fn ray(&self, camera: Point<Camera>) -> Vector3<f64> {
         self.model.ray(camera.vector())
     }
+}
+
+fn first_joints(pair: &Pair) -> Option<[f64; 3]> {
+    pair.joints_rad.map(|[j1, j2, j3, ..]| [j1, j2, j3])
+}
+
+/// The Gaussian process of the points that are believed, or of as many of them as it needs; what it does not believe is struck from
+/// `keep`.
+fn gaussian(pairs: &[Pair], points: &Points, keep: &mut [bool]) -> Result<gp::Fitted, FitError> {
+    let mut used: Vec<usize> = (0..keep.len()).filter(|&i| keep[i]).collect();
+    let method = Method::Gp;
+    let too_few = FitError::TooFew {
+        have: used.len(),
+        need: method.fewest_pairs(),
+        method: method.name(),
+    };
+    if used.len() < method.fewest_pairs() {
+        return Err(too_few);
+    }
+    if used.len() > gp::MOST_POINTS {
+        // spread over a file that may be in the order of a lattice
+        used.sort_by(|a, b| {
+            let place = |i: usize| (i as f64 * 0.618_033_988_749_895).fract();
+            place(*a).total_cmp(&place(*b))
+        });
+        used.truncate(gp::MOST_POINTS);
+        used.sort_unstable();
+    }
+    let of = |all: &[Vector3<f64>]| -> Vec<Vector3<f64>> { used.iter().map(|&i| all[i]).collect() };
+    let joints: Option<Vec<_>> = used.iter().map(|&i| first_joints(&pairs[points.index[i]])).collect();
+    let mut fitted = gp::fit(&of(&points.camera), &of(&points.command), joints.as_deref()).ok_or(too_few)?;
+    for (&i, &kept) in used.iter().zip(&fitted.keep) {
+        keep[i] = kept;
+    }
+    // from places among the usable points to places among the believed
+    let mut place = 0;
+    for (i, &kept) in keep.iter().enumerate() {
+        if kept && used.binary_search(&i).is_ok() {
+            fitted.choice.points.push(place);
+        }
+        place += usize::from(kept);
+    }
+    Ok(fitted)
 }
 
 fn shape(settings: &Settings) -> Shape {

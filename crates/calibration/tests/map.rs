@@ -100,7 +100,7 @@ proptest! {
         let targets = lattice(&volume(), 150.0).expect("a lattice");
         let pairs: Vec<Pair> = targets.iter().map(|t| pair(t.id, Some(t.node), t.command, camera_from_base * t.command)).collect();
         let query = anywhere(&mut Pcg64Mcg::seed_from_u64(seed));
-        for method in [Method::Rigid, Method::Affine, Method::Lattice] {
+        for method in [Method::Rigid, Method::Affine, Method::Lattice, Method::Gp] {
             let (map, report) = Map::fit(&pairs, &Settings { method, ..Settings::default() }).expect("a map");
             let found = map.apply(camera_from_base * query);
             prop_assert!(found.base.distance_mm(query) < 1e-6, "{method:?}: {:?}", found.base);
@@ -182,10 +182,11 @@ fn spoiled(seed: u64) -> (Vec<Pair>, Vec<u64>) {
 fn outliers_and_holes_do_no_harm() {
     let (pairs, outliers) = spoiled(11);
     assert!(outliers.len() > 12);
-    let worst_of = |as_published: bool| {
+    let worst_of = |method: Method, as_published: bool| {
         let (map, report) = Map::fit(
             &pairs,
             &Settings {
+                method,
                 as_published,
                 ..Settings::default()
             },
@@ -203,17 +204,19 @@ fn outliers_and_holes_do_no_harm() {
         }
         (worst, inside, report)
     };
-    let (worst, inside, report) = worst_of(false);
-    assert!(worst < 0.35, "{worst}");
-    assert!(inside > 3900, "most of the volume stays usable: {inside}");
-    let rejected: Vec<u64> = report.rejected.iter().map(|r| r.id).collect();
-    assert!(
-        outliers.iter().all(|id| rejected.contains(id)),
-        "missed one of {outliers:?}: {rejected:?}"
-    );
-    assert!(rejected.len() <= outliers.len() + 3, "lost good pairs: {rejected:?}");
-    assert!(report.held_out.total.max_mm < 0.8);
-    let (published, ..) = worst_of(true);
+    for method in [Method::Lattice, Method::Gp] {
+        let (worst, inside, report) = worst_of(method, false);
+        assert!(worst < 0.35, "{worst}");
+        assert!(inside > 3900, "most of the volume stays usable: {inside}");
+        let rejected: Vec<u64> = report.rejected.iter().map(|r| r.id).collect();
+        assert!(
+            outliers.iter().all(|id| rejected.contains(id)),
+            "missed one of {outliers:?}: {rejected:?}"
+        );
+        assert!(rejected.len() <= outliers.len() + 3, "lost good pairs: {rejected:?}");
+        assert!(report.held_out.total.max_mm < 0.8);
+    }
+    let (published, ..) = worst_of(Method::Lattice, true);
     assert!(
         published > 5.0,
         "without rejection the same pairs must be harmful: {published}"
@@ -223,7 +226,11 @@ fn outliers_and_holes_do_no_harm() {
 #[test]
 fn the_missing_corner_is_not_inside() {
     let (pairs, _) = spoiled(12);
-    let (map, report) = Map::fit(&pairs, &Settings::default()).expect("a map");
+    let lattice = Settings {
+        method: Method::Lattice,
+        ..Settings::default()
+    };
+    let (map, report) = Map::fit(&pairs, &lattice).expect("a map");
     assert!(
         report.neighbourhoods.len() > 1,
         "the fallback was needed: {:?}",
@@ -292,6 +299,7 @@ fn a_map_survives_its_file_and_knows_its_cell() {
     let settings = Settings {
         identity: identity.clone(),
         date: "2026-11-22T01:30:00Z".into(),
+        method: Method::Lattice,
         ..Settings::default()
     };
     let (pairs, _) = spoiled(13);
@@ -329,8 +337,8 @@ fn a_map_survives_its_file_and_knows_its_cell() {
         Map::load(&path).expect_err("must be refused")
     };
     assert!(matches!(
-        refused(&text.replacen("\"version\":1", "\"version\":2", 1)),
-        MapError::Version { found: 2, .. }
+        refused(&text.replacen("\"version\":2", "\"version\":3", 1)),
+        MapError::Version { found: 3, .. }
     ));
     assert!(matches!(refused(&text[..text.len() / 2]), MapError::Format { .. }));
     assert!(matches!(

@@ -63,10 +63,10 @@ pub struct Fit {
     /// Map file to write
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
-    /// rigid, affine or lattice (the paper's, with rejection of outliers)
-    #[arg(long, default_value = "lattice", value_parser = method)]
+    /// gp (Gaussian process and ripple of the gears), lattice (the paper's, with rejection of outliers), affine or rigid
+    #[arg(long, default_value = "gp", value_parser = method)]
     method: Method,
-    /// Exactly as published: no rejection, no fallback
+    /// With --method lattice exactly as published: no rejection, no fallback
     #[arg(long)]
     as_published: bool,
     /// Arm that the map belongs to
@@ -105,10 +105,10 @@ pub struct Verify {
 }
 
 fn method(name: &str) -> Result<Method, String> {
-    [Method::Rigid, Method::Affine, Method::Lattice]
+    [Method::Gp, Method::Lattice, Method::Affine, Method::Rigid]
         .into_iter()
         .find(|m| m.name() == name)
-        .ok_or_else(|| format!("'{name}' is not one of rigid, affine, lattice"))
+        .ok_or_else(|| format!("'{name}' is not one of gp, lattice, affine, rigid"))
 }
 
 pub fn run(command: &Command) -> Result<Ended> {
@@ -159,6 +159,9 @@ fn capture(args: &Capture) -> Result<Ended> {
 }
 
 fn fit(args: &Fit) -> Result<Ended> {
+    if args.as_published && args.method != Method::Lattice {
+        bail!("--as-published is for the paper's method: add --method lattice");
+    }
     let pairs = read_pairs(&args.pairs)?;
     let settings = Settings {
         method: args.method,
