@@ -456,6 +456,8 @@ pub(crate) struct Answer {
     pub(crate) base: Vector3<f64>,
     /// Standard deviation along each axis across the ray, and along it, of map and one measurement, mm.
     pub(crate) sigma_mm: [f64; 2],
+    /// Variance of the map in units of the variance of one measurement, the larger of the two.
+    pub(crate) leverage: f64,
 }
 
 impl Gp {
@@ -536,6 +538,7 @@ impl Gp {
         let variance = self.linear(place);
         Answer {
             base,
+            leverage: (variance[0] / self.noise_mm[0].powi(2)).max(variance[1] / self.noise_mm[1].powi(2)),
             sigma_mm: [0, 1].map(|c| self.scale[c] * (variance[c] + self.noise_mm[c].powi(2)).sqrt()),
         }
     }

@@ -5,9 +5,10 @@
 //! `Point<Camera>` into a `Point<Base>` with a sigma across and along the viewing ray and a word on whether it lies in the
 //! calibrated volume. [`verify`] tells from fresh pairs whether a map still holds. It uses only `geometry`.
 //!
-//! The method is the paper's Algorithm 2 (global linear map, 27 neighbours, second-order interpolation) with what real data
-//! needs: outliers are rejected by robust local prediction, and thin neighbourhoods fall back to wider ones, to first order, and at
-//! last to the global map.
+//! Two methods stand side by side. `gp`, the default, is a Gaussian process of what a rigid motion leaves, across and along the
+//! viewing ray, with waves of the joint angles for the ripple of the gears: 100 points do. `lattice` is the paper's Algorithm 2
+//! (global linear map, 27 neighbours, second-order interpolation) with what real data needs: outliers are rejected by robust local
+//! prediction, and thin neighbourhoods fall back to wider ones, to first order, and at last to the global map.
 //!
 //! ```
 //! use calibration::{Map, Pair, Settings, Volume, lattice};
@@ -21,7 +22,7 @@
 //!     .into_iter()
 //!     .map(|target| Pair {
 //!         id: target.id,
-//!         node: Some(target.node),
+//!         node: target.node,
 //!         t_s: 6.0 * target.id as f64,
 //!         command: target.command,
 //!         pixel: None,
@@ -53,6 +54,6 @@ mod ripple;
 pub use lattice::Level;
 pub use map::{Hull, Identity, Map, MapError, MappedPoint, Method, Settings, camera_identity};
 pub use pair::{Pair, PairError, PairWriter, Query, read_pairs, read_queries, write_pairs};
-pub use plan::{PlanError, Target, Volume, lattice, node_counts};
+pub use plan::{PlanError, Target, Volume, lattice, node_counts, scattered};
 pub use report::{Figures, FitReport, Rejected, Spread, Verification, verify};
 pub use rigid::FitError;

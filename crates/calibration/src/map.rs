@@ -337,7 +337,7 @@ impl Map {
                 base: Point::from_vector(answer.base),
                 sigma_lateral_mm: lateral * beyond,
                 sigma_depth_mm: depth * beyond,
-                hull: self.hull(&e),
+                hull: hull(&e, answer.leverage, 1.5),
             };
         }
         let sigma = |component: usize| {
@@ -350,19 +350,7 @@ impl Map {
             base: Point::from_vector(e.base),
             sigma_lateral_mm: sigma(0),
             sigma_depth_mm: sigma(1),
-            hull: self.hull(&e),
-        }
-    }
-
-    fn hull(&self, e: &Estimate) -> Hull {
-        let leverage: f64 = e.variance.iter().sum();
-        // a point measured on the border falls on either side of it by noise
-        if e.outside <= 0.01 && e.nearest <= 1.2 && leverage <= MAX_LEVERAGE {
-            Hull::Inside
-        } else if e.outside <= 1.0 && e.nearest <= 2.0 {
-            Hull::Edge
-        } else {
-            Hull::Outside
+            hull: hull(&e, e.variance.iter().sum(), 1.2),
         }
     }
 
@@ -489,6 +477,18 @@ impl Map {
 
     pub(crate) fn ray(&self, camera: Point<Camera>) -> Vector3<f64> {
         self.model.ray(camera.vector())
+    }
+}
+
+/// Where a point lies that is so far (in nodes) from the nearest calibrated one at most, if it is to be inside.
+fn hull(e: &Estimate, leverage: f64, reach: f64) -> Hull {
+    // a point measured on the border falls on either side of it by noise
+    if e.outside <= 0.01 && e.nearest <= reach && leverage <= MAX_LEVERAGE {
+        Hull::Inside
+    } else if e.outside <= 1.0 && e.nearest <= 2.0 {
+        Hull::Edge
+    } else {
+        Hull::Outside
     }
 }
 

@@ -1,4 +1,4 @@
-//! Where to take the marker: the paper's lattice, ordered for a short tour.
+//! Where to take the marker: the paper's lattice, or fewer points spread evenly; ordered for a short tour.
 
 use geometry::{Base, Point};
 use serde::{Deserialize, Serialize};
@@ -37,8 +37,8 @@ impl Volume {
 pub struct Target {
     /// Number of the visit, in order.
     pub id: u64,
-    /// Lattice node (i along x, j along y, k along z).
-    pub node: [i32; 3],
+    /// Lattice node (i along x, j along y, k along z); `None` off a lattice.
+    pub node: Option<[i32; 3]>,
     /// Where the marker goes.
     pub command: Point<Base>,
 }
@@ -57,6 +57,12 @@ pub enum PlanError {
     Volume {
         /// Its edges, mm.
         extent_mm: [f64; 3],
+    },
+    /// Too few or too many points.
+    #[error("{points} points make no calibration; choose 20 to 2,000 (100 take 10 minutes)")]
+    Points {
+        /// What was asked for.
+        points: usize,
     },
     /// More nodes than anyone would visit.
     #[error("{nodes} nodes at {spacing_mm} mm would take days; choose a wider spacing (the limit is 100,000)")]
@@ -108,13 +114,90 @@ pub fn lattice(volume: &Volume, spacing_mm: f64) -> Result<Vec<Target>, PlanErro
                 let at = |a: usize| min[a] + extent[a] * f64::from(node[a]) / f64::from(counts[a] - 1);
                 targets.push(Target {
                     id: targets.len() as u64,
-                    node,
+                    node: Some(node),
                     command: Point::new(at(0), at(1), at(2)),
                 });
             }
         }
     }
     Ok(targets)
+}
+
+/// So many points over a volume, its corners first among them, the others spread evenly (the R3 sequence, Roberts 2018) and drawn
+/// towards the borders, where a fit is least certain; as a short tour.
+///
+/// # Errors
+/// [`PlanError::Points`], [`PlanError::Volume`].
+pub fn scattered(volume: &Volume, points: usize) -> Result<Vec<Target>, PlanError> {
+    if !(20..=2000).contains(&points) {
+        return Err(PlanError::Points { points });
+    }
+    let extent_mm = volume.extent_mm();
+    if !extent_mm.iter().all(|e| e.is_finite() && *e > 0.0) {
+        return Err(PlanError::Volume { extent_mm });
+    }
+    let corner = |c: usize| [0, 1, 2].map(|a| (c >> a & 1) as f64);
+    // powers of the number whose fourth power is itself and one
+    let steps = [
+        0.819_172_513_396_164_5,
+        0.671_043_606_703_789_2,
+        0.549_700_477_901_970_3,
+    ];
+    let inner = |n: usize| {
+        steps.map(|step| {
+            let even = (0.5 + n as f64 * step).fract();
+            0.5 * (even + 0.5 - 0.5 * (std::f64::consts::PI * even).cos())
+        })
+    };
+    let min = volume.min.to_array();
+    let places = (0..8).map(corner).chain((1..=points - 8).map(inner));
+    let commands: Vec<Point<Base>> = places
+        .map(|u| {
+            Point::new(
+                min[0] + extent_mm[0] * u[0],
+                min[1] + extent_mm[1] * u[1],
+                min[2] + extent_mm[2] * u[2],
+            )
+        })
+        .collect();
+    let visit = |(id, command): (usize, Point<Base>)| Target {
+        id: id as u64,
+        node: None,
+        command,
+    };
+    Ok(tour(commands).into_iter().enumerate().map(visit).collect())
+}
+
+/// The points in the order of a short way from the first: always to the nearest, then crossings taken out (2-opt).
+fn tour(mut points: Vec<Point<Base>>) -> Vec<Point<Base>> {
+    for k in 1..points.len() {
+        let here = points[k - 1];
+        let nearest =
+            (k..points.len()).min_by(|&a, &b| here.distance_mm(points[a]).total_cmp(&here.distance_mm(points[b])));
+        points.swap(k, nearest.unwrap_or(k));
+    }
+    for _ in 0..20 {
+        let mut shorter = false;
+        for a in 0..points.len().saturating_sub(2) {
+            for b in a + 2..points.len() {
+                let step = |p: usize, q: usize| {
+                    if q < points.len() {
+                        points[p].distance_mm(points[q])
+                    } else {
+                        0.0
+                    }
+                };
+                if step(a, b) + step(a + 1, b + 1) + 1e-9 < step(a, a + 1) + step(b, b + 1) {
+                    points[a + 1..=b].reverse();
+                    shorter = true;
+                }
+            }
+        }
+        if !shorter {
+            break;
+        }
+    }
+    points
 }
 
 #[cfg(test)]
@@ -145,6 +228,39 @@ mod tests {
         assert_eq!(node_counts(&paper(), 130.0)?, [5, 8, 7]);
         assert!(targets.iter().any(|t| t.command == paper().max));
         assert_eq!(node_counts(&paper(), 5000.0)?, [3, 3, 3]);
+        Ok(())
+    }
+
+    #[test]
+    fn scattered_points_fill_the_volume_in_a_short_tour() -> Result<(), PlanError> {
+        let targets = scattered(&paper(), 100)?;
+        assert_eq!(targets.len(), 100);
+        assert!(targets.iter().all(|t| paper().contains(t.command) && t.node.is_none()));
+        for c in 0..8 {
+            let at = |a: usize| if c >> a & 1 == 0 { paper().min } else { paper().max }.to_array()[a];
+            let corner = Point::new(at(0), at(1), at(2));
+            assert!(
+                targets.iter().any(|t| t.command.distance_mm(corner) < 1e-9),
+                "{corner:?}"
+            );
+        }
+        // nowhere far from all of them
+        for k in 0..500 {
+            let u = |m: f64| (f64::from(k) * m).fract();
+            let place = Point::new(
+                950.0 + 400.0 * u(0.618),
+                -450.0 + 900.0 * u(0.414),
+                150.0 + 750.0 * u(0.732),
+            );
+            let nearest = targets
+                .iter()
+                .map(|t| t.command.distance_mm(place))
+                .fold(f64::INFINITY, f64::min);
+            assert!(nearest < 200.0, "{place:?}: {nearest}");
+        }
+        let way: f64 = targets.windows(2).map(|w| w[0].command.distance_mm(w[1].command)).sum();
+        assert!(way < 100.0 * 160.0, "{way} mm"); // an even spread has neighbours 140 mm apart
+        assert!(matches!(scattered(&paper(), 10), Err(PlanError::Points { .. })));
         Ok(())
     }
 

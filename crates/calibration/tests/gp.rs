@@ -220,3 +220,28 @@ fn a_file_gives_the_same_answers() -> Result<(), Box<dyn std::error::Error>> {
     }
     Ok(())
 }
+
+#[test]
+fn what_no_point_supports_is_not_inside() -> Result<(), Box<dyn std::error::Error>> {
+    // nothing was visited in one eighth of the volume
+    let corner = |p: &Point<Base>| p.x_mm() > 1150.0 && p.y_mm() > 0.0 && p.z_mm() > 525.0;
+    let pairs: Vec<Pair> = pairs(7, 150).into_iter().filter(|p| !corner(&p.command)).collect();
+    let (map, _) = Map::fit(&pairs, &gp())?;
+    let rng = &mut Pcg64Mcg::seed_from_u64(9);
+    let (mut inside, mut supported, mut deep, mut deep_inside) = (0, 0, 0, 0);
+    for _ in 0..2000 {
+        let joints = anywhere(rng);
+        let at = Point::from_vector(tool(joints));
+        let hull = map.apply(camera_from_base() * true_tool(joints)).hull;
+        if !corner(&at) {
+            supported += 1;
+            inside += usize::from(hull == Hull::Inside);
+        } else if at.x_mm() > 1250.0 && at.y_mm() > 150.0 && at.z_mm() > 650.0 {
+            deep += 1;
+            deep_inside += usize::from(hull == Hull::Inside);
+        }
+    }
+    assert!(inside * 100 > supported * 85, "{inside} of {supported}");
+    assert!(deep > 20 && deep_inside == 0, "{deep_inside} of {deep}");
+    Ok(())
+}

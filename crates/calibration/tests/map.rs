@@ -77,7 +77,7 @@ fn perfect(spacing_mm: f64, world: impl Fn(Point<Base>) -> Point<Base>) -> Vec<P
     let targets = lattice(&volume(), spacing_mm).expect("a lattice");
     targets
         .iter()
-        .map(|t| pair(t.id, Some(t.node), t.command, camera_from_base() * world(t.command)))
+        .map(|t| pair(t.id, t.node, t.command, camera_from_base() * world(t.command)))
         .collect()
 }
 
@@ -98,7 +98,7 @@ proptest! {
         let camera_from_base: Transform<Camera, Base> =
             Transform::from_parts([x, 100.0, 2500.0], UnitQuaternion::from_euler_angles(roll, pitch, yaw));
         let targets = lattice(&volume(), 150.0).expect("a lattice");
-        let pairs: Vec<Pair> = targets.iter().map(|t| pair(t.id, Some(t.node), t.command, camera_from_base * t.command)).collect();
+        let pairs: Vec<Pair> = targets.iter().map(|t| pair(t.id, t.node, t.command, camera_from_base * t.command)).collect();
         let query = anywhere(&mut Pcg64Mcg::seed_from_u64(seed));
         for method in [Method::Rigid, Method::Affine, Method::Lattice, Method::Gp] {
             let (map, report) = Map::fit(&pairs, &Settings { method, ..Settings::default() }).expect("a map");

@@ -166,7 +166,7 @@ async fn visit(
 ) -> Result<(Pair, Option<String>), DeviceError> {
     let mut pair = Pair {
         id: target.id,
-        node: Some(target.node),
+        node: target.node,
         t_s: devices.clock.now_s(),
         command: target.command,
         pixel: None,

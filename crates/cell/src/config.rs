@@ -90,6 +90,9 @@ pub struct Inspection {
     pub second_look_mm: f64,
     /// A screw seen within this distance of a target is that target, mm.
     pub same_screw_mm: f64,
+    /// How much likelier a doubtful head is a screw once the cover that it may hold has not come off: a missed screw always holds
+    /// it, and of covers without one about one in ten jams.
+    pub stuck_cover_odds: f64,
     /// Time that is budgeted for computing on a picture, s per megapixel. Only a simulated clock needs it.
     pub vision_s_per_mpx: f64,
 }
@@ -102,6 +105,7 @@ impl Default for Inspection {
             depth_frames: 1,
             second_look_mm: 32.0,
             same_screw_mm: 4.0,
+            stuck_cover_odds: 10.0,
             vision_s_per_mpx: 0.05,
         }
     }
@@ -112,8 +116,8 @@ impl Default for Inspection {
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Exclusion {
-    /// Candidates for review that a face may have before it is excluded. Each is a head whose recess cannot be judged: if
-    /// it is a screw, it cannot be driven, and the cover behind it stays.
+    /// Candidates for review that a face may have before it is excluded: heads whose recess cannot be judged. Fewer are left alone;
+    /// if the cover then does not come off, one of them is probably a screw.
     pub review_max: usize,
     /// Only candidates with at least this score count.
     pub review_score_min: f64,
@@ -130,7 +134,7 @@ pub struct Exclusion {
 impl Default for Exclusion {
     fn default() -> Self {
         Self {
-            review_max: 0,
+            review_max: 2,
             review_score_min: 0.3,
             face_tilt_max_rad: 8f64.to_radians(),
             heads_lean_max_rad: 9f64.to_radians(),

@@ -136,11 +136,13 @@ impl ScrewAttempt {
         self.bursts.len().saturating_sub(1)
     }
     /// Out, as far as driver and camera say. A driver that did not answer is believed to have done it if the screw is gone; one that
-    /// slipped is not, since a worn recess may only have become hard to see.
+    /// slipped is not, since a worn recess may only have become hard to see. A bit that meets nothing where a screw was reported out
+    /// has found its hole.
     pub fn removed(&self) -> bool {
         match self.end() {
             Some(DriveEnd::Removed) => self.still_there != Some(true),
             Some(DriveEnd::TimeOut) => self.still_there == Some(false),
+            Some(DriveEnd::MissedHead) => self.bursts.iter().any(|b| b.end == Some(DriveEnd::Removed)),
             _ => false,
         }
     }
@@ -763,6 +765,16 @@ mod tests {
             },
         );
         assert_eq!(record.screws_out(), 0);
+        // the bit finds nothing there: what the picture took for a screw was its hole
+        record.apply(
+            3.0,
+            &Event::Driven {
+                found: 0,
+                arm: "a".into(),
+                burst: burst(DriveEnd::MissedHead),
+            },
+        );
+        assert_eq!(record.screws_out(), 1);
     }
 
     #[test]

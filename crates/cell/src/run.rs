@@ -24,14 +24,21 @@ const COVER_OFF_MM: f64 = 15.0;
 /// Finds screws in a shot. [`vision::Detector`] does; tests have their own.
 pub trait Finder: Send + Sync {
     /// Every candidate, in pixels of the shot, and in the camera's frame where it has depth.
-    fn find(&self, frame: &RgbdFrame) -> Vec<vision::Screw>;
+    ///
+    /// # Arguments
+    /// * `odds` – how much likelier than the picture alone says a doubtful head is a screw (1 without other evidence).
+    fn find(&self, frame: &RgbdFrame, odds: f64) -> Vec<vision::Screw>;
     /// What made it, for the record.
     fn model(&self) -> String;
 }
 
 impl Finder for vision::Detector {
-    fn find(&self, frame: &RgbdFrame) -> Vec<vision::Screw> {
-        self.detect(frame, &vision::Options::default()).screws
+    fn find(&self, frame: &RgbdFrame, odds: f64) -> Vec<vision::Screw> {
+        let options = vision::Options {
+            odds,
+            ..vision::Options::default()
+        };
+        self.detect(frame, &options).screws
     }
     fn model(&self) -> String {
         vision::Detector::model(self).id().to_owned()
@@ -459,7 +466,7 @@ impl Way<'_> {
         self.turn(face).await?;
         let config = self.runner.config.clone();
         let shot = shoot(&self.runner.devices, None, config.inspection.depth_frames).await?;
-        let screws = self.runner.finder.find(&shot.frame);
+        let screws = self.runner.finder.find(&shot.frame, self.odds(purpose));
         self.budget(&shot);
         let heads: Vec<(Pixel, f64)> = screws.iter().map(|s| (s.pixel, s.diameter_px)).collect();
         let fit = FaceFit::around(&shot.frame, &heads, config.inspection.working_depth_mm);
@@ -530,6 +537,20 @@ impl Way<'_> {
         arms.filter(|(_, (arm, _))| arm.driver.is_some())
             .map(|(arm, (_, map))| Reach { arm, map })
             .collect()
+    }
+
+    /// How much likelier than pictures say a doubtful head is a screw: a cover that does not come off is evidence.
+    fn odds(&self, purpose: Purpose) -> f64 {
+        match purpose {
+            Purpose::Missed => self.runner.config.inspection.stuck_cover_odds,
+            Purpose::Survey | Purpose::Work => 1.0,
+        }
+    }
+
+    /// The same for the face that is being worked on.
+    fn face_odds(&self) -> f64 {
+        let purpose = self.record.faces.last().map(|f| f.purpose);
+        purpose.map_or(1.0, |purpose| self.odds(purpose))
     }
 
     /// Lets the time pass that computing on a picture is budgeted with.
@@ -643,7 +664,7 @@ impl Way<'_> {
             config.inspection.depth_frames.max(1),
         )
         .await?;
-        let screws = self.runner.finder.find(&near.frame);
+        let screws = self.runner.finder.find(&near.frame, self.face_odds());
         self.budget(&near);
         let picture = self
             .runner
@@ -736,7 +757,7 @@ impl Way<'_> {
         let mut pictures = Vec::new();
         for region in regions_around(&camera, &pixels, half_px) {
             let near = shoot(&self.runner.devices, Some(region), 0).await?;
-            let screws = self.runner.finder.find(&near.frame);
+            let screws = self.runner.finder.find(&near.frame, self.face_odds());
             self.budget(&near);
             pictures.push(
                 self.runner

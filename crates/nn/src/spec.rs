@@ -171,6 +171,30 @@ impl Spec {
 }
 
 impl LayerSpec {
+    /// A convolution with batch normalisation and rectification.
+    pub fn conv(kernel: usize, stride: usize, dilation: usize, out: usize) -> Self {
+        LayerSpec::Conv {
+            kernel,
+            stride,
+            dilation,
+            out,
+            batch_norm: true,
+            relu: true,
+        }
+    }
+
+    /// A last layer: the same weighted sums at every pixel, with a bias, as they are.
+    pub fn output(out: usize) -> Self {
+        LayerSpec::Conv {
+            kernel: 1,
+            stride: 1,
+            dilation: 1,
+            out,
+            batch_norm: false,
+            relu: false,
+        }
+    }
+
     /// Output pixels along a side with `size` input pixels.
     pub(crate) fn output_size(&self, size: usize) -> usize {
         match self {

@@ -5,7 +5,7 @@
 use nn::{LayerSpec, Spec};
 use std::path::PathBuf;
 use training::{Progress, TrainSettings, try_network};
-use vision::layout::{CLIP_PX, FINE_CHANNELS, fine_spec};
+use vision::layout::{CLIP_PX, FINE_CHANNELS, FINE_INPUT_CHANNELS, fine_spec};
 
 struct Loss;
 
@@ -17,41 +17,17 @@ impl Progress for Loss {
     }
 }
 
-/// Kernel side, stride, dilation, channels of each layer before the output.
+/// Kernel side, stride, dilation, channels of each layer before the output; three halvings are followed by a doubling.
 fn network(layers: &[[usize; 4]]) -> Spec {
-    let conv = |&[kernel, stride, dilation, out]: &[usize; 4]| LayerSpec::Conv {
-        kernel,
-        stride,
-        dilation,
-        out,
-        batch_norm: true,
-        relu: true,
-    };
-    let mut layers: Vec<LayerSpec> = layers.iter().map(conv).collect();
-    if layers
+    let halvings = layers.iter().filter(|l| l[1] == 2).count();
+    let mut layers: Vec<_> = layers
         .iter()
-        .map(|l| {
-            if matches!(l, LayerSpec::Conv { stride: 2, .. }) {
-                2
-            } else {
-                1
-            }
-        })
-        .product::<usize>()
-        == 8
-    {
-        layers.push(LayerSpec::Upsample2);
-    }
-    layers.push(LayerSpec::Conv {
-        kernel: 1,
-        stride: 1,
-        dilation: 1,
-        out: FINE_CHANNELS,
-        batch_norm: false,
-        relu: false,
-    });
+        .map(|&[k, s, d, out]| LayerSpec::conv(k, s, d, out))
+        .collect();
+    layers.extend((halvings == 3).then_some(LayerSpec::Upsample2));
+    layers.push(LayerSpec::output(FINE_CHANNELS));
     Spec {
-        input_channels: 3,
+        input_channels: FINE_INPUT_CHANNELS,
         layers,
     }
 }
@@ -67,64 +43,16 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         work: Some(PathBuf::from(work)),
         ..TrainSettings::default()
     };
+    #[rustfmt::skip]
     let all = [
         ("shipped", fine_spec()),
-        // the first version's
-        (
-            "narrow",
-            network(&[
-                [3, 2, 1, 24],
-                [3, 2, 1, 48],
-                [3, 1, 1, 48],
-                [3, 1, 2, 48],
-                [3, 1, 2, 48],
-            ]),
-        ),
-        (
-            "eighth",
-            network(&[
-                [3, 2, 1, 32],
-                [3, 2, 1, 64],
-                [3, 2, 1, 128],
-                [3, 1, 1, 128],
-                [3, 1, 1, 128],
-                [3, 1, 1, 128],
-            ]),
-        ),
-        (
-            "deep",
-            network(&[
-                [3, 2, 1, 32],
-                [3, 2, 1, 48],
-                [3, 1, 1, 48],
-                [3, 1, 1, 48],
-                [3, 1, 2, 48],
-                [3, 1, 2, 48],
-                [3, 1, 2, 48],
-            ]),
-        ),
-        (
-            "full",
-            network(&[
-                [3, 1, 1, 16],
-                [3, 2, 1, 32],
-                [3, 2, 1, 64],
-                [3, 1, 1, 64],
-                [3, 1, 2, 64],
-                [3, 1, 2, 64],
-            ]),
-        ),
-        (
-            "half",
-            network(&[
-                [3, 2, 1, 32],
-                [3, 1, 1, 32],
-                [3, 2, 1, 64],
-                [3, 1, 1, 64],
-                [3, 1, 2, 64],
-                [3, 1, 2, 64],
-            ]),
-        ),
+        ("narrow", network(&[[3, 2, 1, 24], [3, 2, 1, 48], [3, 1, 1, 48], [3, 1, 2, 48], [3, 1, 2, 48]])), // the first version's
+        ("quarter", network(&[[3, 2, 1, 32], [3, 2, 1, 64], [3, 1, 1, 64], [3, 1, 2, 64], [3, 1, 2, 64]])), // the second version's
+        ("eighth", network(&[[3, 2, 1, 32], [3, 2, 1, 64], [3, 2, 1, 128], [3, 1, 1, 128], [3, 1, 1, 128], [3, 1, 1, 128]])),
+        ("stem", network(&[[3, 2, 1, 32], [3, 1, 1, 32], [3, 2, 1, 64], [3, 2, 1, 128], [3, 1, 1, 128], [3, 1, 1, 128]])),
+        ("deep", network(&[[3, 2, 1, 32], [3, 2, 1, 64], [3, 1, 1, 64], [3, 1, 1, 64], [3, 2, 1, 128], [3, 1, 1, 128], [3, 1, 1, 128]])),
+        ("deeper", network(&[[3, 2, 1, 32], [3, 1, 1, 32], [3, 2, 1, 64], [3, 1, 1, 64], [3, 1, 1, 64], [3, 2, 1, 128], [3, 1, 1, 128], [3, 1, 1, 128], [3, 1, 1, 128]])),
+        ("wide", network(&[[3, 2, 1, 32], [3, 2, 1, 64], [3, 1, 1, 64], [3, 2, 1, 160], [3, 1, 1, 160], [3, 1, 1, 160]])),
     ];
     println!("name     parameters  MFLOP  train s   loss  recall  log loss  drive  centre median p95 px");
     for (name, spec) in all {

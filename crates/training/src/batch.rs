@@ -2,14 +2,15 @@
 
 use crate::samples::{Classes, Label, PATCH_PX, Patch, only};
 use geometry::{Pixel, RgbImage};
+use nalgebra::{Matrix2, Rotation2, Vector2};
 use nn::Tensor;
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use rayon::prelude::*;
 use vision::Clip;
 use vision::layout::{
-    CLASS_CHANNELS, CLASSES, CLIP_CENTER_PX, CLIP_PX, Class, IGNORE_RADIUS, LABEL_RADIUS, LN_DIAMETER, NOMINAL_HEAD_PX,
-    OFFSET_U, OFFSET_UNIT_PX, OFFSET_V, STRIDE, cell_center_px, network_value,
+    CLASS_CHANNELS, CLASSES, CLIP_CENTER_PX, CLIP_PX, Class, FINE_INPUT_CHANNELS, IGNORE_RADIUS, LABEL_RADIUS,
+    LN_DIAMETER, NOMINAL_HEAD_PX, OFFSET_U, OFFSET_UNIT_PX, OFFSET_V, STRIDE, cell_center_px, network_value,
 };
 
 /// Side of the coarse network's training crop, px.
@@ -17,8 +18,13 @@ pub const COARSE_PX: usize = 96;
 
 /// Share of pictures with a cable, a pipe or a strip of sheet drawn across: the rendered ones rarely have it over a head.
 const OCCLUDED: f64 = 0.06;
+/// Share of pictures with blotches of one colour over everything, and with the edge of a shadow across.
+const GRIMY: f64 = 0.10;
+const SHADED: f64 = 0.12;
+/// Share of pictures that are squeezed as if seen from well aside; the others as a face that leans by a few degrees.
+const ASLANT: f64 = 0.25;
 /// Share of pictures that get another camera's light, colour and noise in full; the others are nearly left as rendered.
-const RELIT: f64 = 0.5;
+const RELIT: f64 = 0.6;
 
 /// Weight of each regression beside the classes' cross-entropy, and the error from which it counts linearly. Offsets
 /// that weigh more than this take the network's attention from telling a cross from a hexalobular recess.
@@ -39,6 +45,13 @@ impl Stage {
         match self {
             Stage::Coarse => COARSE_PX,
             Stage::Fine => CLIP_PX,
+        }
+    }
+
+    fn input_channels(self) -> usize {
+        match self {
+            Stage::Coarse => 3,
+            Stage::Fine => FINE_INPUT_CHANNELS,
         }
     }
 }
@@ -66,11 +79,12 @@ pub struct Batch {
 pub fn batch(stage: Stage, patches: &[Patch], picks: &[usize], seed: u64) -> Batch {
     let side = stage.side_px();
     let cells = side / STRIDE;
-    let mut input = Tensor::zeros(picks.len(), side, side, 3);
+    let channels = stage.input_channels();
+    let mut input = Tensor::zeros(picks.len(), side, side, channels);
     let mut targets = vec![Target::default(); picks.len() * cells * cells];
     input
         .data
-        .par_chunks_mut(side * side * 3)
+        .par_chunks_mut(side * side * channels)
         .zip(targets.par_chunks_mut(cells * cells))
         .zip(picks)
         .enumerate()
@@ -99,53 +113,47 @@ fn fill(stage: Stage, patch: &Patch, rng: &mut Pcg64Mcg, pixels: &mut [f32], tar
     let mut source = focus.filter(|_| stage == Stage::Fine).unwrap_or([middle, middle]);
     source = source.map(|c| c + normal(jitter).clamp(-12.0, 12.0));
     let scale = normal(0.10).exp().clamp(0.75, 1.4);
-    let angle: f64 = normal(0.12);
-    let flip = rng.random_bool(0.5);
-    let turns = rng.random_range(0..4);
-    // crop pixel -> patch pixel
-    let (sin, cos) = angle.sin_cos();
+    let tilt: f64 = normal(0.12);
+    let mild = normal(0.05).exp().clamp(0.88, 1.14);
+    // width over height of a circle is the square of this
+    let squeeze = if rng.random_bool(ASLANT) {
+        rng.random_range(0.76..1.0f64)
+    } else {
+        mild
+    };
+    let along: f64 = rng.random_range(0.0..std::f64::consts::PI);
+    let turn = tilt + std::f64::consts::FRAC_PI_2 * f64::from(rng.random_range(0..4u8));
+    let flip = if rng.random_bool(0.5) { -1.0 } else { 1.0 };
+    // crop pixel -> patch pixel: squeezed along an axis, turned, perhaps mirrored
     let half = if stage == Stage::Fine {
         CLIP_CENTER_PX as f64
     } else {
         side as f64 / 2.0
     };
-    let forward = move |x: f64, y: f64| {
-        let (mut dx, mut dy) = (x - half, y - half);
-        if flip {
-            dx = -dx;
-        }
-        for _ in 0..turns {
-            (dx, dy) = (-dy, dx);
-        }
-        [
-            source[0] + (cos * dx - sin * dy) / scale,
-            source[1] + (sin * dx + cos * dy) / scale,
-        ]
-    };
-    let backward = move |u: f64, v: f64| {
-        let (du, dv) = ((u - source[0]) * scale, (v - source[1]) * scale);
-        let (mut dx, mut dy) = (cos * du + sin * dv, -sin * du + cos * dv);
-        for _ in 0..turns {
-            (dx, dy) = (dy, -dx);
-        }
-        if flip {
-            dx = -dx;
-        }
-        [dx + half, dy + half]
-    };
+    let axis = Rotation2::new(along);
+    let squeezed = axis * Matrix2::new(squeeze, 0.0, 0.0, 1.0 / squeeze) * axis.inverse();
+    let matrix = Rotation2::new(turn) * squeezed * Matrix2::new(flip, 0.0, 0.0, 1.0) / scale;
+    let inverse = matrix.try_inverse().unwrap_or_default(); // its determinant is ±1/scale²
+    let source = Vector2::from(source);
+    let forward = |x: f64, y: f64| source + matrix * Vector2::new(x - half, y - half);
+    let backward = |u: f64, v: f64| -> [f64; 2] { (inverse * (Vector2::new(u, v) - source)).add_scalar(half).into() };
     let mut rgb = vec![0f32; side * side * 3];
-    let (corner, right, down) = (forward(0.0, 0.0), forward(1.0, 0.0), forward(0.0, 1.0));
-    let along =
-        |axis: usize, x: f64, y: f64| corner[axis] + x * (right[axis] - corner[axis]) + y * (down[axis] - corner[axis]);
+    let (corner, right, down) = (forward(0.0, 0.0), matrix.column(0), matrix.column(1));
     for y in 0..side {
         for x in 0..side {
-            let [u, v] = [0, 1].map(|axis| along(axis, x as f64, y as f64));
-            sample(&patch.rgb, u, v, &mut rgb[3 * (y * side + x)..][..3]);
+            let at = corner + right * x as f64 + down * y as f64;
+            sample(&patch.rgb, at.x, at.y, &mut rgb[3 * (y * side + x)..][..3]);
         }
     }
     let strand = rng.random_bool(OCCLUDED).then(|| Strand::sample(half, scale, rng));
+    if rng.random_bool(GRIMY) {
+        grime(&mut rgb, side, rng);
+    }
     if let Some(strand) = &strand {
         strand.draw(&mut rgb, side);
+    }
+    if rng.random_bool(SHADED) {
+        shadow(&mut rgb, side, rng);
     }
     relight(&mut rgb, side, rng);
     let bytes: Vec<u8> = rgb.iter().map(|v| v.round().clamp(0.0, 255.0) as u8).collect();
@@ -305,11 +313,56 @@ impl Strand {
     }
 }
 
+/// Blotches of rust, mud, white rust or black grime on less than half of the picture.
+fn grime(rgb: &mut [f32], side: usize, rng: &mut Pcg64Mcg) {
+    let base: [f32; 3] = [
+        [120.0, 62.0, 30.0],
+        [95.0, 80.0, 60.0],
+        [205.0, 205.0, 198.0],
+        [38.0, 36.0, 34.0],
+    ][rng.random_range(0..4)];
+    let color = base.map(|c| c * rng.random_range(0.75..1.25f32));
+    let cell_px = rng.random_range(3.0..11.0f32);
+    let (opaque, from) = (rng.random_range(0.3..0.8f32), rng.random_range(0.56..0.70f32));
+    let knots = (side as f32 / cell_px) as usize + 2;
+    let grid: Vec<f32> = (0..knots * knots).map(|_| rng.random()).collect();
+    for (k, pixel) in rgb.chunks_exact_mut(3).enumerate() {
+        let (x, y) = ((k % side) as f32 / cell_px, (k / side) as f32 / cell_px);
+        let (i, j, fx, fy) = (x as usize, y as usize, x.fract(), y.fract());
+        let row = |j: usize| grid[j * knots + i] * (1.0 - fx) + grid[j * knots + i + 1] * fx;
+        let cover = opaque * ((row(j) * (1.0 - fy) + row(j + 1) * fy - from) * 8.0).clamp(0.0, 1.0);
+        for (value, color) in pixel.iter_mut().zip(color) {
+            *value += cover * (color - *value);
+        }
+    }
+}
+
+/// Darkens one side of a line near the middle.
+fn shadow(rgb: &mut [f32], side: usize, rng: &mut Pcg64Mcg) {
+    let (sin, cos) = rng.random_range(0.0..std::f32::consts::TAU).sin_cos();
+    let (off, soft, dark) = (
+        rng.random_range(-16.0..16.0f32),
+        rng.random_range(0.5..3.0f32),
+        rng.random_range(0.35..0.85f32),
+    );
+    let half = side as f32 / 2.0;
+    for (k, pixel) in rgb.chunks_exact_mut(3).enumerate() {
+        let beyond = ((k % side) as f32 - half) * cos + ((k / side) as f32 - half) * sin - off;
+        let shade = 1.0 - (1.0 - dark) * (0.5 + beyond / soft).clamp(0.0, 1.0);
+        pixel.iter_mut().for_each(|value| *value *= shade);
+    }
+}
+
 /// Light, colour, contrast, blur and noise as another camera would have them.
 fn relight(rgb: &mut [f32], side: usize, rng: &mut Pcg64Mcg) {
     let full = rng.random_bool(RELIT);
     let much = if full { 1.0f32 } else { 0.25 };
-    let gain = (much * rng.random_range(-0.35..0.30f32)).exp();
+    let dark = if full && rng.random_bool(0.12) {
+        rng.random_range(-1.8..0.0f32)
+    } else {
+        0.0
+    };
+    let gain = (dark + much * rng.random_range(-0.35..0.30f32)).exp();
     let gamma = (much * rng.random_range(-0.35..0.33f32)).exp();
     let cast: [f32; 3] = std::array::from_fn(|_| 1.0 + much * rng.random_range(-0.15..0.18f32));
     let gray = if full && rng.random_bool(0.2) {
@@ -317,7 +370,12 @@ fn relight(rgb: &mut [f32], side: usize, rng: &mut Pcg64Mcg) {
     } else {
         much * rng.random_range(0.0..0.3f32)
     };
-    let invert_order = full && rng.random_bool(0.12); // red and blue exchanged: rust must not be all there is to see
+    // colours exchanged: rust must not be all there is to see
+    let order = if full && rng.random_bool(0.25) {
+        [[2, 1, 0], [1, 0, 2], [0, 2, 1], [1, 2, 0], [2, 0, 1]][rng.random_range(0..5)]
+    } else {
+        [0, 1, 2]
+    };
     let slope = [rng.random_range(-0.25..0.25f32), rng.random_range(-0.25..0.25f32)];
     let noise = if full && rng.random_bool(0.7) {
         rng.random_range(0.0..7.0f32)
@@ -338,9 +396,8 @@ fn relight(rgb: &mut [f32], side: usize, rng: &mut Pcg64Mcg) {
         for (c, value) in pixel.iter_mut().enumerate() {
             *value = curve(*value + gray * (luma - *value)) * shade * cast[c];
         }
-        if invert_order {
-            pixel.swap(0, 2);
-        }
+        let now = [pixel[0], pixel[1], pixel[2]];
+        pixel.copy_from_slice(&order.map(|c: usize| now[c]));
     }
     if full && rng.random_bool(0.35) {
         soften(rgb, side, rng.random_range(0.1..0.9f32));
@@ -384,8 +441,9 @@ fn soften(rgb: &mut [f32], side: usize, share: f32) {
     }
 }
 
-/// Loss and gradient over a batch: cross-entropy against sets of classes, smooth L1 for the regressions.
-pub fn loss(stage: Stage, output: &Tensor, targets: &[Target], grad: &mut Tensor) -> f32 {
+/// Loss and gradient over a batch: cross-entropy against sets of classes, smooth L1 for the regressions, these with `place` times
+/// their weight.
+pub fn loss(stage: Stage, output: &Tensor, targets: &[Target], place: f32, grad: &mut Tensor) -> f32 {
     let classes = if stage == Stage::Fine {
         CLASSES
     } else {
@@ -435,7 +493,7 @@ pub fn loss(stage: Stage, output: &Tensor, targets: &[Target], grad: &mut Tensor
                 .zip(truth.into_iter().zip(PLACE_WEIGHTS))
             {
                 let error = z[channel] - truth;
-                let w = weight / known;
+                let w = place * weight / known;
                 if error.abs() < knee {
                     sum += f64::from(w * 0.5 * error * error / knee);
                     g[channel] = w * error / knee;

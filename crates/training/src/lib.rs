@@ -10,16 +10,15 @@ mod face;
 mod real;
 mod samples;
 mod train;
+mod trial;
 mod tune;
 
 pub use evaluate::{
-    Coverage, CropEvaluation, DecoyRow, DriveRow, EvaluateError, Evaluation, Evaluator, FIRST_EVALUATION_SEED,
-    FalseFind, Miss, PhotoEvaluation, Product, Quantiles, SceneRow, StageOne, evaluate_crops, evaluate_faces,
-    evaluate_truth_folder, evaluate_yolo_folder, truth_files,
+    Coverage, CropEvaluation, CurvePoint, DecoyRow, DriveRow, EvaluateError, Evaluation, Evaluator,
+    FIRST_EVALUATION_SEED, FalseFind, Miss, PhotoEvaluation, Product, Quantiles, ReliabilityBin, SceneRow, StageOne,
+    evaluate_crops, evaluate_faces, evaluate_truth_folder, evaluate_yolo_folder, truth_files,
 };
 pub use geometry::{Rate, wilson};
-pub use train::{
-    Progress, TRAINING_SEEDS, TUNING_SEEDS, TrainError, TrainReport, TrainSettings, Trial, measure_networks, train,
-    try_network,
-};
+pub use train::{Progress, TRAINING_SEEDS, TUNING_SEEDS, TrainError, TrainReport, TrainSettings, train};
+pub use trial::{Trial, measure_networks, try_network};
 pub use tune::Tuning;

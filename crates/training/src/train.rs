@@ -2,10 +2,9 @@
 
 use crate::batch::{Batch, Stage, batch, loss};
 use crate::real;
-use crate::samples::{PATCH_PX, Patch, any_fastener, only, rendered};
+use crate::samples::{Patch, any_fastener, only, rendered};
 use crate::tune::{self, Tuning};
-use geometry::{Pixel, RgbImage};
-use nn::{Network, Spec, Tensor, Trainer};
+use nn::{Tensor, Trainer};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use serde::Serialize;
@@ -15,7 +14,6 @@ use std::{
     collections::BTreeMap,
     ops::Range,
     path::{Path, PathBuf},
-    time::Instant,
 };
 use vision::layout::{Class, coarse_spec, fine_spec};
 use vision::{Detector, Settings, Thresholds, decode_model, encode_model};
@@ -28,6 +26,10 @@ pub const TRAINING_SEEDS: Range<u64> = 0..500_000;
 pub const TUNING_SEEDS: Range<u64> = 500_000..1_000_000;
 /// Steps over which the learning rate rises to its full value: batch norm has no statistics to stand on before.
 const WARM_UP: usize = 100;
+/// Weight of the places in the last quarter of the steps, when the classes are nearly learned, against that before.
+const LATE_PLACE: f32 = 4.0;
+/// What decides beside the settings what a network learns: a network half trained by another recipe is not gone on with.
+const RECIPE: &str = include_str!("batch.rs");
 /// Steps after which a network is written to the work folder.
 const KEEP_EVERY: usize = 500;
 
@@ -71,7 +73,7 @@ pub enum TrainError {
     },
 }
 
-/// The recipe. Optimiser, batch, loss and steps of the learning rate are the paper's (section 4.2).
+/// The recipe. Optimiser, batch and first learning rate are the paper's (section 4.2).
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct TrainSettings {
     /// Seed of the first unit.
@@ -82,10 +84,8 @@ pub struct TrainSettings {
     pub background: usize,
     /// Pictures in a step.
     pub batch: usize,
-    /// First learning rate (paper: 0.01).
+    /// Highest learning rate (paper: 0.01); it falls in a straight line to nothing at the last step.
     pub learning_rate: f32,
-    /// Factor on it after each third of the steps (paper: 0.25 every 10 of 30 epochs).
-    pub decay: f32,
     /// Steps of stage 1.
     pub coarse_steps: usize,
     /// Steps of each network of stage 2, those that they share included.
@@ -115,15 +115,14 @@ impl Default for TrainSettings {
     fn default() -> Self {
         Self {
             first_unit: 0,
-            units: 500,
+            units: 700,
             background: 8,
             batch: 128,
             learning_rate: 0.01,
-            decay: 0.25,
             coarse_steps: 1900,
-            fine_steps: 8000,
-            shared_steps: 5000,
-            tuning_faces: 40,
+            fine_steps: 11000,
+            shared_steps: 9500,
+            tuning_faces: 100,
             seed: 1,
             from: None,
             from_model: None,
@@ -181,30 +180,19 @@ pub fn train(settings: &TrainSettings, out: &Path, progress: &dyn Progress) -> R
         progress,
     };
     let mut losses = BTreeMap::new();
-    let begun = |name: &str, spec: Spec, seed| match start.get(name) {
-        Some(bytes) => Trainer::from_bytes(bytes),
-        None => Ok(Trainer::new(spec, seed)),
+    let coarse = match start.get("coarse") {
+        Some(bytes) => Trainer::from_bytes(bytes)?,
+        None => Trainer::new(coarse_spec(), settings.seed),
     };
-    let coarse = lesson.learn(
-        "coarse",
-        begun("coarse", coarse_spec(), settings.seed)?,
-        Stage::Coarse,
-        settings.coarse_steps..settings.coarse_steps,
-        &mut losses,
-    )?;
+    let coarse = lesson.learn("coarse", coarse, Stage::Coarse, settings.coarse_steps, &mut losses)?;
     // the members of the ensemble share their first steps, then each goes its own way
     let shared = if settings.from.is_some() {
         0
     } else {
         settings.shared_steps
     };
-    let trunk = lesson.learn(
-        "shared",
-        Trainer::new(fine_spec(), settings.seed + 1),
-        Stage::Fine,
-        shared..settings.fine_steps,
-        &mut losses,
-    )?;
+    let trunk = Trainer::new(fine_spec(), settings.seed + 1);
+    let trunk = lesson.learn("shared", trunk, Stage::Fine, shared, &mut losses)?;
     let mut fine = Vec::new();
     for k in 0..ENSEMBLE {
         let name = format!("fine{k}");
@@ -212,8 +200,7 @@ pub fn train(settings: &TrainSettings, out: &Path, progress: &dyn Progress) -> R
             Some(bytes) => Trainer::from_bytes(bytes)?,
             None => trunk.clone(),
         };
-        let steps = settings.fine_steps..settings.fine_steps;
-        let trainer = lesson.learn(&name, trainer, Stage::Fine, steps, &mut losses)?;
+        let trainer = lesson.learn(&name, trainer, Stage::Fine, settings.fine_steps, &mut losses)?;
         fine.push(trainer.to_bytes(&BTreeMap::new())?);
     }
     let coarse = coarse.to_bytes(&BTreeMap::new())?;
@@ -347,44 +334,58 @@ fn begun(settings: &TrainSettings) -> Result<(TrainSettings, BTreeMap<String, Ve
 }
 
 /// What every network of a training learns from, and how.
-struct Lesson<'a> {
-    settings: &'a TrainSettings,
-    patches: &'a [Patch],
-    progress: &'a dyn Progress,
+pub struct Lesson<'a> {
+    /// The recipe.
+    pub settings: &'a TrainSettings,
+    /// What is learned from.
+    pub patches: &'a [Patch],
+    /// Where it says how far it is.
+    pub progress: &'a dyn Progress,
 }
 
 impl Lesson<'_> {
-    /// Trains from the step where the trainer is up to `steps.start`, at the learning rates of a training of `steps.end` steps.
-    fn learn(
+    /// Trains from the step where the trainer is up to the `last`, and puts the loss over the last steps into `losses`.
+    ///
+    /// # Errors
+    /// [`TrainError`] for the work folder.
+    pub fn learn(
         &self,
         name: &str,
         mut trainer: Trainer,
         stage: Stage,
-        steps: Range<usize>,
+        last: usize,
         losses: &mut BTreeMap<String, f32>,
     ) -> Result<Trainer, TrainError> {
         let settings = self.settings;
-        let (last, total) = (steps.start, steps.end);
+        let total = match stage {
+            Stage::Coarse => settings.coarse_steps,
+            Stage::Fine => settings.fine_steps,
+        };
         let kept = settings.work.as_ref().map(|folder| {
-            let key = json!([settings_key(settings), trainer.spec(), name]).to_string();
+            let key = json!([RECIPE, settings_key(settings), trainer.spec(), name]).to_string();
             folder.join(format!("{name}-{}.checkpoint", &hex(&Sha256::digest(key))[..12]))
         });
+        let mut mean_loss = f32::NAN;
         if let Some(path) = kept.as_ref().filter(|p| p.exists()) {
-            trainer = Trainer::load_checkpoint(path)?;
+            let damaged = || TrainError::Damaged { path: path.clone() };
+            let bytes = std::fs::read(path).map_err(|_| damaged())?;
+            trainer = Trainer::from_bytes(&bytes).map_err(|_| damaged())?;
+            let loss = nn::metadata(&bytes).ok().and_then(|m| m.get("loss")?.parse().ok());
+            mean_loss = loss.unwrap_or(f32::NAN);
         }
         let pools = pools(self.patches, stage);
         let mut grad = Tensor::default();
-        let mut mean_loss = f32::NAN;
         for step in trainer.steps() as usize..last {
             // a generator a step: a training that goes on draws what it would have drawn
             let mut rng = Pcg64Mcg::seed_from_u64(hash(&[settings.seed, name_hash(name), step as u64]));
             let picks = picks(&pools, settings.batch, &mut rng);
             let Batch { input, targets } = batch(stage, self.patches, &picks, rng.random());
             let output = trainer.forward(&input);
-            let now = loss(stage, &output, &targets, &mut grad);
+            let place = if 4 * step >= 3 * total { LATE_PLACE } else { 1.0 };
+            let now = loss(stage, &output, &targets, place, &mut grad);
             trainer.backward(&grad);
             let rise = ((step + 1) as f32 / WARM_UP as f32).min(1.0);
-            let rate = settings.learning_rate * settings.decay.powi((3 * step / total) as i32) * rise;
+            let rate = settings.learning_rate * rise * (1.0 - step as f32 / total as f32);
             trainer.adam_step(rate, 0.0);
             mean_loss = if mean_loss.is_nan() {
                 now
@@ -399,7 +400,8 @@ impl Lesson<'_> {
                 .as_ref()
                 .filter(|_| (step + 1) % KEEP_EVERY == 0 || step + 1 == last)
             {
-                geometry::write_aside(path, &trainer.checkpoint_bytes(&BTreeMap::new())?)?;
+                let told = BTreeMap::from([("loss".to_owned(), mean_loss.to_string())]);
+                geometry::write_aside(path, &trainer.checkpoint_bytes(&told)?)?;
             }
         }
         if !mean_loss.is_nan() {
@@ -447,137 +449,4 @@ fn pools(patches: &[Patch], stage: Stage) -> Vec<(f64, Vec<usize>)> {
         .collect();
     pools.retain(|p| !p.1.is_empty());
     pools
-}
-
-/// How one architecture of stage 2 does, alone, on patches of units that it did not learn from.
-#[derive(Clone, Debug, Serialize)]
-pub struct Trial {
-    /// Loss over the last steps of training.
-    pub loss: f32,
-    /// Time to train, s.
-    pub train_s: f64,
-    /// Patches of cross screws.
-    pub screws: usize,
-    /// Patches of other things and of background.
-    pub others: usize,
-    /// Share of the screws with a score above that of all but 3 in 1000 of the others.
-    pub recall: f64,
-    /// Mean of -ln of the probability of what is there: cross screw or not.
-    pub log_loss: f64,
-    /// Share of other fasteners whose drive is the likeliest of all.
-    pub drive_right: f64,
-    /// Median and 95th percentile of the centre's error on screws, px.
-    pub center_px: [f64; 2],
-}
-
-/// Trains one network of stage 2 on the rendered patches of `settings` and measures it on those of `units` units of the tuning seeds.
-///
-/// # Errors
-/// As [`train`].
-pub fn try_network(
-    spec: Spec,
-    settings: &TrainSettings,
-    units: u64,
-    progress: &dyn Progress,
-) -> Result<Trial, TrainError> {
-    let work = settings.work.as_deref();
-    let seeds = settings.first_unit..settings.first_unit + settings.units;
-    let mut patches = rendered(seeds, settings.background, work, &|_| {})?;
-    patches.extend(real::patches(&settings.data, settings.seed)?);
-    let lesson = Lesson {
-        settings: &TrainSettings {
-            work: None,
-            ..settings.clone()
-        },
-        patches: &patches,
-        progress,
-    };
-    let begin = Instant::now();
-    let mut losses = BTreeMap::new();
-    let steps = settings.fine_steps..settings.fine_steps;
-    let trainer = lesson.learn(
-        "trial",
-        Trainer::new(spec, settings.seed),
-        Stage::Fine,
-        steps,
-        &mut losses,
-    )?;
-    let train_s = begin.elapsed().as_secs_f64();
-    let first = TUNING_SEEDS.start + 100_000;
-    let unseen = rendered(first..first + units, settings.background, work, &|_| {})?;
-    Ok(Trial {
-        loss: losses.get("trial").copied().unwrap_or(f32::NAN),
-        train_s,
-        ..judged(&[trainer.network()], &unseen)
-    })
-}
-
-/// What networks of stage 2 say of the patches of units, for instance to compare those that they learned from with others.
-///
-/// # Errors
-/// As [`train`], for the work folder.
-pub fn measure_networks(
-    networks: &[Network],
-    units: Range<u64>,
-    settings: &TrainSettings,
-) -> Result<Trial, TrainError> {
-    let patches = rendered(units, settings.background, settings.work.as_deref(), &|_| {})?;
-    Ok(judged(networks, &patches))
-}
-
-fn judged(networks: &[Network], patches: &[Patch]) -> Trial {
-    let (mut screws, mut others, mut errors) = (Vec::new(), Vec::new(), Vec::new());
-    let (mut drives, mut right) = (0, 0);
-    for patch in patches {
-        let Some(picture) = RgbImage::from_raw(PATCH_PX as u32, PATCH_PX as u32, patch.rgb.clone()) else {
-            continue;
-        };
-        let label = patch.labels.first().filter(|_| patch.focused);
-        let middle = PATCH_PX as f64 / 2.0;
-        // stage 1 is off by a few pixels
-        let place = label.map_or([middle; 2], |l| [f64::from(l.u_px) + 2.0, f64::from(l.v_px) - 2.0]);
-        let Some(found) = vision::look(networks, &picture, &[Pixel::new(place[0], place[1])]).pop() else {
-            continue;
-        };
-        let score = f64::from(found.of(Class::Cross));
-        match label {
-            Some(l) if l.classes == only(Class::Cross) => {
-                screws.push(score);
-                errors.push((found.center.u_px - f64::from(l.u_px)).hypot(found.center.v_px - f64::from(l.v_px)));
-            }
-            Some(l) => {
-                others.push(score);
-                let drive = Class::ALL
-                    .into_iter()
-                    .find(|&c| c.is_fastener() && only(c) == l.classes);
-                let likeliest = Class::ALL
-                    .into_iter()
-                    .max_by(|a, b| found.of(*a).total_cmp(&found.of(*b)));
-                drives += usize::from(drive.is_some());
-                right += usize::from(drive.is_some() && drive == likeliest);
-            }
-            None if patch.labels.is_empty() => others.push(score),
-            None => {}
-        }
-    }
-    let sorted = |mut v: Vec<f64>| {
-        v.sort_by(f64::total_cmp);
-        v
-    };
-    let (screws, others, errors) = (sorted(screws), sorted(others), sorted(errors));
-    let at = |v: &[f64], share: f64| v.get((share * v.len() as f64) as usize).copied().unwrap_or(f64::NAN);
-    let limit = at(&others, 0.997);
-    let part = |hits: usize, of: usize| hits as f64 / of.max(1) as f64;
-    let sure = |p: &f64| -p.max(1e-6).ln();
-    let log_loss = screws.iter().map(sure).sum::<f64>() + others.iter().map(|p| sure(&(1.0 - p))).sum::<f64>();
-    Trial {
-        loss: f32::NAN,
-        train_s: 0.0,
-        screws: screws.len(),
-        others: others.len(),
-        recall: part(screws.iter().filter(|s| **s > limit).count(), screws.len()),
-        log_loss: log_loss / (screws.len() + others.len()).max(1) as f64,
-        drive_right: part(right, drives),
-        center_px: [at(&errors, 0.5), at(&errors, 0.95)],
-    }
 }

@@ -2,6 +2,7 @@
 
 use crate::face::{Shot, face_of, shot};
 use geometry::Pixel;
+use nalgebra::{Matrix3, Vector3};
 use scene::Unit;
 use serde::{Deserialize, Serialize};
 use vision::layout::Class;
@@ -14,12 +15,14 @@ use vision::{
 const ONE_SIGMA: f64 = 0.6827;
 /// Errors below which a factor is not measured.
 const ENOUGH: usize = 20;
+/// Faces that the cues' factors are measured on; more need not be held in memory at once.
+const CUE_FACES: usize = 40;
 /// Cost of a screw that is not found, in units of one miss.
 const MISS: f64 = 1.0;
-/// Cost of something taken for a screw: the bit goes where it must not.
-const FALSE_FIND: f64 = 3.0;
-/// Cost of a look by a person: unattended, the unit is excluded for it, so it is nearly as bad as a miss.
-const LOOK: f64 = 0.6;
+/// Cost of something taken for a screw: a burst on what is none, and a mark on the part. A missed screw costs the unit.
+const FALSE_FIND: f64 = 1.5;
+/// Cost of a look by a person; unattended, the head is left alone until its cover tells.
+const LOOK: f64 = 0.3;
 
 /// What was chosen, and by which figures.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -40,15 +43,13 @@ pub struct Tuning {
 
 /// Chooses thresholds, sigma factors and the scores' calibration on `faces` rendered faces from `first_seed` on.
 pub fn tune(model: &Model, first_seed: u64, faces: u64, done: &dyn Fn(u64)) -> Tuning {
-    let shots: Vec<Shot> = (first_seed..first_seed + faces)
-        .filter_map(|seed| {
-            let shot = shot(&Unit::sample(seed), face_of(seed), seed);
-            done(seed - first_seed + 1);
-            shot
-        })
-        .collect();
+    let mut shots = (first_seed..first_seed + faces).filter_map(|seed| {
+        done(seed - first_seed + 1);
+        shot(&Unit::sample(seed), face_of(seed), seed)
+    });
+    let kept: Vec<Shot> = shots.by_ref().take(CUE_FACES).collect();
     let mut corrections = Corrections::default();
-    cue_factors(model, &shots, &mut corrections);
+    cue_factors(model, &kept, &mut corrections);
     // every candidate speaks, uncalibrated: what they say is what is calibrated
     let open = Settings {
         thresholds: Thresholds {
@@ -63,7 +64,7 @@ pub fn tune(model: &Model, first_seed: u64, faces: u64, done: &dyn Fn(u64)) -> T
     let detector = with(model, open);
     let (mut scores, mut unfound, mut screws) = (Vec::new(), 0, 0);
     let (mut ratios, mut depths) = (Vec::new(), [Vec::new(), Vec::new()]);
-    for shot in &shots {
+    for shot in kept.into_iter().chain(shots) {
         let found = detector.detect(&shot.frame, &Options::default()).screws;
         screws += shot.truth.screws.iter().filter(|s| s.detectable).count();
         for truth in shot.truth.screws.iter().filter(|s| s.detectable) {
@@ -107,9 +108,9 @@ pub fn tune(model: &Model, first_seed: u64, faces: u64, done: &dyn Fn(u64)) -> T
         );
     }
     corrections.depth_sigma *= one_sigma(depth_ratios);
-    (corrections.score_slope, corrections.score_offset) = platt(&scores);
+    corrections.score = calibration(&scores);
     for (score, _) in &mut scores {
-        *score = logistic(corrections.score_slope * logit(*score) + corrections.score_offset);
+        *score = corrections.probability(*score);
     }
     // with scores that are probabilities, least expected cost is a matter of the costs alone
     let (accept, review) = (1.0 - LOOK / FALSE_FIND, LOOK / MISS);
@@ -123,7 +124,7 @@ pub fn tune(model: &Model, first_seed: u64, faces: u64, done: &dyn Fn(u64)) -> T
         faces,
         screws,
         without_candidate: unfound,
-        cost_a_face: (cost(&scores, accept, review) + MISS * unfound as f64) / shots.len().max(1) as f64,
+        cost_a_face: (cost(&scores, accept, review) + MISS * unfound as f64) / faces.max(1) as f64,
     }
 }
 
@@ -196,45 +197,33 @@ fn cue_factors(model: &Model, shots: &[Shot], corrections: &mut Corrections) {
     corrections.learned_sigma = one_sigma(learned);
 }
 
-fn logit(p: f64) -> f64 {
-    let p = p.clamp(1e-7, 1.0 - 1e-7);
-    (p / (1.0 - p)).ln()
-}
-
-fn logistic(odds: f64) -> f64 {
-    1.0 / (1.0 + (-odds).exp())
-}
-
-/// Slope and offset in log odds that make scores probabilities (Platt 1999, with his guard against overconfidence).
-fn platt(scores: &[(f64, bool)]) -> (f64, f64) {
+/// [`Corrections::score`] by which the scores are likeliest, with targets that guard against overconfidence (Platt 1999).
+fn calibration(scores: &[(f64, bool)]) -> [f64; 3] {
+    let start = Vector3::from(Corrections::default().score);
     let real = scores.iter().filter(|s| s.1).count() as f64;
     let not = scores.len() as f64 - real;
     if real < 10.0 || not < 10.0 {
-        return (1.0, 0.0);
+        return start.into();
     }
     let targets = [1.0 / (not + 2.0), (real + 1.0) / (real + 2.0)];
-    let (mut slope, mut offset) = (1.0, 0.0);
+    let mut curve = start;
     for _ in 0..100 {
-        // Newton's step on the cross-entropy, with a little weight on the slope's staying where it is
-        let (mut g, mut h) = ([0.1 * (slope - 1.0), 0.0], [0.1, 0.0, 1e-6]);
+        // Newton's step on the cross-entropy, with a little weight on the slopes' staying where they are
+        let stay = Vector3::new(0.1, 0.1, 1e-6);
+        let (mut slope, mut bend) = (stay.component_mul(&(curve - start)), Matrix3::from_diagonal(&stay));
         for &(score, real) in scores {
-            let x = logit(score);
-            let p = logistic(slope * x + offset);
-            let (miss, weight) = (p - targets[usize::from(real)], (p * (1.0 - p)).max(1e-9));
-            g = [g[0] + miss * x, g[1] + miss];
-            h = [h[0] + weight * x * x, h[1] + weight * x, h[2] + weight];
+            let score = score.clamp(1e-7, 1.0 - 1e-7);
+            let terms = Vector3::new(score.ln(), -(1.0 - score).ln(), 1.0);
+            let p = 1.0 / (1.0 + (-terms.dot(&curve)).exp());
+            slope += (p - targets[usize::from(real)]) * terms;
+            bend += (p * (1.0 - p)).max(1e-9) * terms * terms.transpose();
         }
-        let determinant = h[0] * h[2] - h[1] * h[1];
-        let step = [
-            (h[2] * g[0] - h[1] * g[1]) / determinant,
-            (h[0] * g[1] - h[1] * g[0]) / determinant,
-        ];
-        (slope, offset) = (
-            (slope - step[0].clamp(-0.3, 0.3)).clamp(0.2, 3.0),
-            offset - step[1].clamp(-1.0, 1.0),
-        );
+        let Some(inverse) = bend.try_inverse() else { break };
+        curve -= (inverse * slope).map(|step| step.clamp(-0.5, 0.5));
+        // a higher score is never less probable
+        (curve.x, curve.y) = (curve.x.clamp(0.1, 4.0), curve.y.clamp(0.1, 4.0));
     }
-    (slope, offset)
+    curve.into()
 }
 
 /// Cost of all candidates at thresholds: false ones accepted, true ones dropped, and looks in between.
@@ -256,22 +245,27 @@ mod tests {
 
     #[test]
     fn calibrated_scores_are_probabilities_and_thresholds_follow_the_costs() {
-        // scores that claim too much: the odds are the square of what they should be
+        // true odds of what a network says as p: steep where it says no, flat where it says yes
+        let truth = Corrections {
+            score: [1.6, 0.7, 0.4],
+            ..Corrections::default()
+        };
         let mut scores = Vec::new();
-        for k in 1..40 {
-            let p = f64::from(k) / 40.0;
-            let real = (1000.0 * p).round() as usize;
-            scores.extend((0..1000).map(|i| (logistic(2.0 * logit(p) + 0.5), i < real)));
+        for k in 1..80 {
+            let said = f64::from(k) / 80.0;
+            let real = (2000.0 * truth.probability(said)).round() as usize;
+            scores.extend((0..2000).map(|i| (said, i < real)));
         }
-        let (slope, offset) = platt(&scores);
-        assert!(
-            (slope - 0.5).abs() < 0.01 && (offset + 0.25).abs() < 0.02,
-            "{slope} {offset}"
-        );
-        let calibrated: Vec<(f64, bool)> = scores
-            .iter()
-            .map(|&(s, real)| (logistic(slope * logit(s) + offset), real))
-            .collect();
+        let score = calibration(&scores);
+        let found = Corrections {
+            score,
+            ..Corrections::default()
+        };
+        let calibrated: Vec<(f64, bool)> = scores.iter().map(|&(s, real)| (found.probability(s), real)).collect();
+        for (score, _) in &scores {
+            let (is, should) = (found.probability(*score), truth.probability(*score));
+            assert!((is - should).abs() < 0.005, "{score}: {is} for {should}");
+        }
         let (accept, review) = (1.0 - LOOK / FALSE_FIND, LOOK / MISS);
         let best = cost(&calibrated, accept, review);
         for off in [-0.1, 0.1] {

@@ -2,7 +2,9 @@
 
 use crate::{Ended, output};
 use anyhow::{Result, bail};
-use calibration::{Identity, Map, Method, Settings, Volume, read_pairs, read_queries, verify};
+use calibration::{
+    Identity, Map, Method, PlanError, Settings, Target, Volume, lattice, read_pairs, read_queries, scattered, verify,
+};
 use geometry::{Base, Point};
 use serde::Serialize;
 use std::path::PathBuf;
@@ -10,7 +12,7 @@ use std::path::PathBuf;
 /// From marker positions to a map from camera to robot.
 #[derive(clap::Subcommand)]
 pub enum Command {
-    /// Lattice of points for the marker, in a short tour, as CSV
+    /// Points for the marker, in a short tour, as CSV
     #[command(after_help = "Example: unscrew calibrate plan --spacing-mm 50 > plan.csv")]
     Plan(Plan),
     /// Drive an arm with the marker over the lattice and write a pair a visit (simulated cell)
@@ -27,11 +29,31 @@ pub enum Command {
     Verify(Verify),
 }
 
+/// Where the marker goes.
+#[derive(Clone, Copy, clap::Args)]
+pub struct Visits {
+    /// Points spread evenly and towards the borders; 100 take 10 minutes
+    #[arg(long, default_value_t = 150)]
+    points: usize,
+    /// The paper's lattice instead, with so many mm between neighbours (the paper has 50)
+    #[arg(long, value_name = "MM", conflicts_with = "points")]
+    spacing_mm: Option<f64>,
+}
+
+impl Visits {
+    /// The tour through a volume.
+    pub fn over(&self, volume: &Volume) -> Result<Vec<Target>, PlanError> {
+        match self.spacing_mm {
+            Some(spacing_mm) => lattice(volume, spacing_mm),
+            None => scattered(volume, self.points),
+        }
+    }
+}
+
 #[derive(clap::Args)]
 pub struct Plan {
-    /// Distance between neighbouring points, mm
-    #[arg(long, default_value_t = 50.0)]
-    spacing_mm: f64,
+    #[command(flatten)]
+    visits: Visits,
     /// Opposite corners of the volume in the robot's base, mm: x,y,z,x,y,z
     #[arg(long, value_delimiter = ',', num_args = 6, allow_hyphen_values = true, default_values_t = [950.0, -450.0, 150.0, 1350.0, 450.0, 900.0])]
     volume_mm: Vec<f64>,
@@ -45,9 +67,8 @@ pub struct Capture {
     /// Arm that carries the marker: arm_a or arm_b
     #[arg(long, default_value = "arm_a")]
     arm: String,
-    /// Distance between neighbouring points, mm
-    #[arg(long, default_value_t = 50.0)]
-    spacing_mm: f64,
+    #[command(flatten)]
+    visits: Visits,
     /// Seed of the simulated cell: its robots' and lens's true errors
     #[arg(long, default_value_t = 1)]
     cell_seed: u64,
@@ -124,7 +145,7 @@ pub fn run(command: &Command) -> Result<Ended> {
 fn plan(args: &Plan) -> Result<Ended> {
     let v = &args.volume_mm;
     let corner = |k: usize| Point::<Base>::new(v[k], v[k + 1], v[k + 2]);
-    let targets = calibration::lattice(&Volume::between(corner(0), corner(3)), args.spacing_mm)?;
+    let targets = args.visits.over(&Volume::between(corner(0), corner(3)))?;
     if args.json {
         println!(
             "{}",
@@ -134,8 +155,9 @@ fn plan(args: &Plan) -> Result<Ended> {
     }
     println!("id,i,j,k,cmd_x_mm,cmd_y_mm,cmd_z_mm");
     for t in &targets {
-        let ([i, j, k], [x, y, z]) = (t.node, t.command.to_array());
-        println!("{},{i},{j},{k},{x:.4},{y:.4},{z:.4}", t.id);
+        let [x, y, z] = t.command.to_array();
+        let node = t.node.map_or(",,".into(), |[i, j, k]| format!("{i},{j},{k}"));
+        println!("{},{node},{x:.4},{y:.4},{z:.4}", t.id);
     }
     // the paper's robot needed 4.5 h for 2,736 points
     eprintln!(
@@ -147,7 +169,7 @@ fn plan(args: &Plan) -> Result<Ended> {
 }
 
 fn capture(args: &Capture) -> Result<Ended> {
-    let done = crate::run::capture_pairs(args.cell_seed, &args.arm, args.spacing_mm, &args.out)?;
+    let done = crate::run::capture_pairs(args.cell_seed, &args.arm, &args.visits, &args.out)?;
     println!(
         "{}: {} visits, marker found at {}, {:.1} simulated hours",
         args.out.display(),

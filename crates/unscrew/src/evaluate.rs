@@ -58,6 +58,9 @@ pub struct Args {
     /// Write the figures into this JSON file too, with every miss and false find (up to 200)
     #[arg(long, value_name = "FILE")]
     out: Option<PathBuf>,
+    /// Draw reliability of the scores, and recall and precision over the threshold, to this SVG file
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["photos", "crops"])]
+    plot: Option<PathBuf>,
 }
 
 pub fn run(args: &Args) -> Result<Ended> {
@@ -65,7 +68,7 @@ pub fn run(args: &Args) -> Result<Ended> {
         Some(path) => Detector::load(path)?,
         None => Detector::embedded()?,
     };
-    if let Some(path) = &args.out {
+    for path in [&args.out, &args.plot].into_iter().flatten() {
         let folder = path
             .parent()
             .filter(|p| !p.as_os_str().is_empty())
@@ -140,7 +143,11 @@ fn measure<T>(
     }
     bar.finish_and_clear();
     let done = evaluator.pictures();
-    say(args, &evaluator.finish())?;
+    let evaluation = evaluator.finish();
+    say(args, &evaluation)?;
+    if let Some(path) = &args.plot {
+        crate::curve::draw(&evaluation, path)?;
+    }
     if stop.load(Ordering::SeqCst) && (done as u64) < all {
         bail!("stopped after {done} of {all} pictures; the figures are of those");
     }

@@ -4,6 +4,7 @@
 //! the result is not good enough (screws left, verification failed).
 
 mod calibrate;
+mod curve;
 mod detect;
 mod evaluate;
 mod output;
@@ -59,6 +60,10 @@ enum Ended {
 
 fn main() -> ExitCode {
     let cli = Cli::parse();
+    // a reader that has seen enough, such as `head`, ends a command quietly; but never one that moves robots or has learned for an hour
+    if !matches!(cli.command, Command::Run(_) | Command::Train(_)) {
+        sigpipe::reset();
+    }
     let result = match cli.command {
         Command::Run(args) => run::run(&args),
         Command::Detect(args) => detect::run(&args),

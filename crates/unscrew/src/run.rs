@@ -1,12 +1,13 @@
 //! `unscrew run`: units through the cell, with journal, report and summary. Without a cell file the cell is the simulated one.
 
+use crate::calibrate::Visits;
 use crate::{
     Ended, output,
     report::{self, Missed, Report},
     stats,
 };
 use anyhow::{Context, Result, bail};
-use calibration::{Identity, Map, Settings, Volume, camera_identity, lattice, read_pairs};
+use calibration::{Identity, Map, Settings, Volume, camera_identity, read_pairs};
 use cell::{
     CaptureSettings, CellConfig, Journal, Observer, Outcome, Program, Runner, Statistics, UnitRecord,
     capture_pairs as capture,
@@ -52,9 +53,8 @@ pub struct Args {
     /// Folder of the cell's maps: calibrated on the first run, used again after that
     #[arg(long, default_value = "unscrew-cell", value_name = "DIR")]
     maps: PathBuf,
-    /// Distance between neighbouring points when a map has to be made, mm; 50 is the paper's
-    #[arg(long, default_value_t = 50.0)]
-    spacing_mm: f64,
+    #[command(flatten)]
+    visits: Visits,
     /// Model file; left out, the built-in one
     #[arg(long, value_name = "FILE")]
     model: Option<PathBuf>,
@@ -197,7 +197,7 @@ async fn calibrated(
         let bench = SimulatedCell::new(settings.clone());
         bench.mount_jig(Some(k));
         let started_s = bench.devices.clock.now_s();
-        capture_with(&bench, k, args.spacing_mm, &pairs, stop).await?;
+        capture_with(&bench, k, &args.visits, &pairs, stop).await?;
         let hours = (bench.devices.clock.now_s() - started_s) / 3600.0;
         let settings = Settings {
             identity,
@@ -224,12 +224,12 @@ async fn calibrated(
 async fn capture_with(
     bench: &SimulatedCell,
     arm: usize,
-    spacing_mm: f64,
+    visits: &Visits,
     path: &Path,
     stop: &AtomicBool,
 ) -> Result<()> {
     let [low, high] = sim::layout::volume(arm);
-    let plan = lattice(&Volume::between(low, high), spacing_mm)?;
+    let plan = visits.over(&Volume::between(low, high))?;
     let Some(approach) = Direction::<Base>::new(1.0, 0.0, 0.0) else {
         bail!("the approach has no direction");
     };
@@ -264,7 +264,7 @@ pub struct Captured {
 }
 
 /// Captures pairs of one arm of the simulated cell: `unscrew calibrate capture`.
-pub fn capture_pairs(cell_seed: u64, arm: &str, spacing_mm: f64, path: &Path) -> Result<Captured> {
+pub fn capture_pairs(cell_seed: u64, arm: &str, visits: &Visits, path: &Path) -> Result<Captured> {
     let bench = SimulatedCell::new(SimSettings {
         seed: cell_seed,
         ..SimSettings::default()
@@ -279,7 +279,7 @@ pub fn capture_pairs(cell_seed: u64, arm: &str, spacing_mm: f64, path: &Path) ->
         .build()
         .context("cannot start the event loop")?;
     let stop = output::stop_on_ctrl_c();
-    runtime.block_on(capture_with(&bench, k, spacing_mm, path, &stop))?;
+    runtime.block_on(capture_with(&bench, k, visits, path, &stop))?;
     let pairs = read_pairs(path)?;
     Ok(Captured {
         visits: pairs.len(),

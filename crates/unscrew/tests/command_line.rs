@@ -4,7 +4,7 @@ use serde_json::Value;
 use std::{
     fs,
     path::{Path, PathBuf},
-    process::{Command, Output},
+    process::{Command, Output, Stdio},
 };
 
 fn unscrew(folder: &Path, args: &[&str]) -> Output {
@@ -194,22 +194,27 @@ fn fit_and_apply_keep_the_contract() {
 /// One whole unit, calibrated on a wide lattice: nothing the robot was sent to lies outside the calibrated volume, the page and the
 /// summary are there, a second run into the same folder is refused, and the journal's statistics are those of the summary.
 #[test]
+fn a_reader_that_has_seen_enough_ends_a_command_quietly() {
+    let mut child = Command::new(env!("CARGO_BIN_EXE_unscrew"))
+        .args(["calibrate", "plan", "--spacing-mm", "20"])
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .expect("the program starts");
+    drop(child.stdout.take());
+    let output = child.wait_with_output().expect("it ends");
+    let text = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(text.is_empty(), "{text}");
+}
+
+#[test]
 fn a_unit_from_end_to_end() {
     let dir = folder();
     let at = dir.path();
     let output = unscrew(
         at,
         &[
-            "run",
-            "--units",
-            "1",
-            "--seed",
-            "4",
-            "--out",
-            "out",
-            "--spacing-mm",
-            "130",
-            "--json",
+            "run", "--units", "1", "--seed", "4", "--out", "out", "--points", "100", "--json",
         ],
     );
     let text = String::from_utf8_lossy(&output.stderr).into_owned();

@@ -129,6 +129,9 @@ pub struct Options {
     pub head_px: RangeInclusive<f64>,
     /// The bit that is mounted: what it fits is a `screw`, any other drive is `other`.
     pub bit: Drive,
+    /// How much likelier than a picture alone says it is that a doubtful head has that drive: 1, or more where there is other
+    /// evidence, such as a cover that does not come off.
+    pub odds: f64,
 }
 
 impl Default for Options {
@@ -136,6 +139,7 @@ impl Default for Options {
         Self {
             head_px: 20.0..=40.0,
             bit: Drive::Cross,
+            odds: 1.0,
         }
     }
 }
@@ -151,6 +155,8 @@ pub struct Screw {
     pub diameter_px: f64,
     /// Probability of what the verdict says (for `review`: of the mounted bit's drive).
     pub score: f64,
+    /// Probability that the mounted bit fits it.
+    pub fits: f64,
     /// What turns it.
     pub drive: Drive,
     /// What may be done with it.
@@ -400,11 +406,7 @@ impl Detector {
     fn decide(&self, picture: &RgbImage, find: &Find, options: &Options) -> Option<Screw> {
         let settings = &self.model.settings;
         let probability = |drive: Drive| drive.class().map_or(0.0, |c| f64::from(find.evidence.of(c)));
-        let calibrated = |p: f64| {
-            let p = p.clamp(1e-7, 1.0 - 1e-7);
-            let odds = settings.corrections.score_slope * (p / (1.0 - p)).ln() + settings.corrections.score_offset;
-            1.0 / (1.0 + (-odds).exp())
-        };
+        let calibrated = |p: f64| settings.corrections.probability(p);
         let likeliest = Drive::KNOWN
             .into_iter()
             .max_by(|a, b| probability(*a).total_cmp(&probability(*b)))?;
@@ -414,14 +416,15 @@ impl Detector {
         } else {
             Drive::Unknown
         };
-        let fits = calibrated(probability(options.bit));
+        let seen = calibrated(probability(options.bit));
+        let fits = options.odds * seen / (options.odds * seen + 1.0 - seen);
         let t = &settings.thresholds;
         let (verdict, score) = if fits >= f64::from(t.accept) {
             (Verdict::Screw, fits)
-        } else if likeliest != options.bit && calibrated(probability(likeliest)) >= f64::from(t.other) {
-            (Verdict::Other, calibrated(probability(likeliest)))
         } else if fits >= f64::from(t.review) {
             (Verdict::Review, fits)
+        } else if likeliest != options.bit && calibrated(probability(likeliest)) >= f64::from(t.other) {
+            (Verdict::Other, calibrated(probability(likeliest)))
         } else if calibrated(any) >= f64::from(t.other) {
             (Verdict::Other, calibrated(any))
         } else {
@@ -444,6 +447,7 @@ impl Detector {
                 .filter(|_| used(Cue::Circle))
                 .map_or(find.diameter_px, |c| c.diameter_px),
             score,
+            fits,
             drive,
             verdict,
             angle_rad: crossed.filter(|_| used(Cue::Cross)).map(|c| c.angle_rad),

@@ -6,27 +6,29 @@ use nn::{Network, Tensor, softmax};
 use rayon::prelude::*;
 
 use crate::layout::{
-    CLASS_CHANNELS, CLASSES, CLIP_CENTER_PX, CLIP_PX, Class, FINE_CHANNELS, LN_DIAMETER, MAP_CELLS, NOMINAL_HEAD_PX,
-    OFFSET_U, OFFSET_UNIT_PX, OFFSET_V, TRAINED_HEAD_PX, cell_center_px, network_value,
+    CLASS_CHANNELS, CLASSES, CLIP_CENTER_PX, CLIP_PX, Class, FINE_CHANNELS, FINE_INPUT_CHANNELS, LN_DIAMETER,
+    MAP_CELLS, NOMINAL_HEAD_PX, OFFSET_U, OFFSET_UNIT_PX, OFFSET_V, TRAINED_HEAD_PX, cell_center_px, network_value,
 };
 
 /// Luminance (0 to 1, sRGB) that the gamma correction gives a clip's median.
 const MEDIAN_LUMA: f64 = 0.45;
-/// A candidate whose voted centre is farther than this from the middle of its clip is looked at again, px.
-const RECENTER_PX: f64 = 6.0;
 /// Votes farther than this from the centre belong to something else, in head diameters.
 const VOTE_RADIUS: f64 = 0.5;
 /// Radius of the disc whose mean decides about the class, in head diameters.
 const DECISION_RADIUS: f64 = 0.25;
 /// Neighbouring cells see nearly the same pixels: so many of them count as one independent vote.
 const CELLS_A_VOTE: f64 = 4.0;
+/// Half side of the square in which a pixel's contrast is measured, px: about a recess.
+const CONTRAST_REACH_PX: usize = 9;
+/// Contrast that is as good as none (of 2): noise is not to look like a recess.
+const CONTRAST_FLOOR: f32 = 0.03;
 /// Clips that go through the networks at once: bounds the memory.
 const BATCH: usize = 64;
 
-/// From this probability of a fastener on, a clip is also looked at mirrored: the networks' errors differ, their mean is better.
-const WORTH_MIRRORS: f32 = 0.1;
-/// The mirror images beside the clip as it is: signs along u and v.
-const MIRRORS: [[i64; 2]; 3] = [[-1, 1], [1, -1], [-1, -1]];
+/// From this probability of a fastener on, the whole ensemble looks, from all sides.
+const WORTH_MORE: f32 = 0.05;
+/// The clip as it is, and its mirror images: signs along u and v. The networks' errors differ between them.
+const VIEWS: [[i64; 2]; 4] = [[1, 1], [-1, 1], [1, -1], [-1, -1]];
 
 /// A square of the picture around a candidate; outside the picture its border is repeated.
 #[derive(Clone, Debug, PartialEq)]
@@ -93,17 +95,61 @@ impl Clip {
         (MEDIAN_LUMA.ln() / median.ln()).clamp(0.4, 2.5)
     }
 
-    /// What the fine network sees: gamma corrected, -1 to 1, row by row, RGB; `out` has [`CLIP_PX`]² x 3 values.
+    /// What the fine network sees, row by row: RGB, gamma corrected, -1 to 1, then the local contrast; `out` has [`CLIP_PX`]² x
+    /// [`FINE_INPUT_CHANNELS`] values.
     pub fn network_input(&self, out: &mut [f32]) {
         let gamma = self.gamma();
         let table: [f32; 256] = std::array::from_fn(|v| {
             let corrected = 255.0 * (v as f64 / 255.0).powf(gamma);
             network_value(corrected.round() as u8)
         });
-        for (to, &from) in out.iter_mut().zip(&self.rgb) {
-            *to = table[usize::from(from)];
+        let mut luma = Vec::with_capacity(CLIP_PX * CLIP_PX);
+        for (to, from) in out.chunks_exact_mut(FINE_INPUT_CHANNELS).zip(self.rgb.chunks_exact(3)) {
+            for (to, &from) in to.iter_mut().zip(from) {
+                *to = table[usize::from(from)];
+            }
+            luma.push(0.3 * to[0] + 0.6 * to[1] + 0.1 * to[2]);
+        }
+        let contrast = local_contrast(&luma);
+        for (to, contrast) in out.chunks_exact_mut(FINE_INPUT_CHANNELS).zip(contrast) {
+            to[3] = contrast;
         }
     }
+}
+
+/// How far each pixel's luminance is from the mean of the pixels around it, in their standard deviations: a recess in a black head
+/// looks as one in a bright head does.
+fn local_contrast(luma: &[f32]) -> Vec<f32> {
+    const SIDE: usize = CLIP_PX + 1;
+    let mut sums = vec![[0f32; 2]; SIDE * SIDE]; // of luminance and its square, over all pixels above and to the left
+    for y in 0..CLIP_PX {
+        let mut row = [0f32; 2];
+        for x in 0..CLIP_PX {
+            let value = luma[y * CLIP_PX + x];
+            row = [row[0] + value, row[1] + value * value];
+            let above = sums[y * SIDE + x + 1];
+            sums[(y + 1) * SIDE + x + 1] = [row[0] + above[0], row[1] + above[1]];
+        }
+    }
+    let ends = |c: usize| {
+        (
+            c.saturating_sub(CONTRAST_REACH_PX),
+            (c + CONTRAST_REACH_PX + 1).min(CLIP_PX),
+        )
+    };
+    let pixels = (0..CLIP_PX * CLIP_PX).map(|i| (i / CLIP_PX, i % CLIP_PX));
+    pixels
+        .map(|(y, x)| {
+            let ((top, bottom), (left, right)) = (ends(y), ends(x));
+            let n = ((bottom - top) * (right - left)) as f32;
+            let [mean, square] = [0, 1].map(|k| {
+                let at = |y: usize, x: usize| sums[y * SIDE + x][k];
+                (at(bottom, right) - at(top, right) - at(bottom, left) + at(top, left)) / n
+            });
+            let variance = (square - mean * mean).max(0.0);
+            (luma[y * CLIP_PX + x] - mean) / (variance + CONTRAST_FLOOR * CONTRAST_FLOOR).sqrt()
+        })
+        .collect()
 }
 
 /// What the ensemble says about one candidate, in the pixels of the picture that it saw.
@@ -131,36 +177,28 @@ impl Evidence {
     }
 }
 
-/// Runs the ensemble on clips around the places, once more where the voted centre lies far from the middle, and on the mirror
-/// images of what may be a fastener.
+/// Looks at each place with the first network; where that says that there may be a fastener, the whole ensemble looks at the clip
+/// around the centre that it voted for, and at the three mirror images of it, and the mean decides.
 ///
 /// # Arguments
-/// * `networks` – the mean of their answers decides; one network is an ensemble too.
+/// * `networks` – one network is an ensemble too.
 ///
 /// # Returns
 /// Evidence for each place, in the same order.
 pub fn look(networks: &[Network], picture: &RgbImage, places: &[Pixel<space::Clip>]) -> Vec<Evidence> {
-    if picture.width() == 0 || picture.height() == 0 {
+    if picture.width() == 0 || picture.height() == 0 || networks.is_empty() {
         return Vec::new();
     }
-    let mut evidence = look_once(networks, picture, places, [1, 1]);
-    let again: Vec<usize> = (0..places.len())
-        .filter(|&i| evidence[i].center.distance_px(&places[i]) > RECENTER_PX && evidence[i].fastener() > 0.01)
-        .collect();
-    let centers: Vec<_> = again.iter().map(|&i| evidence[i].center).collect();
-    for (&i, second) in again.iter().zip(look_once(networks, picture, &centers, [1, 1])) {
-        evidence[i] = second;
-    }
+    let mut evidence = look_once(&networks[..1], picture, places, VIEWS[0]);
     let worth: Vec<usize> = (0..evidence.len())
-        .filter(|&i| evidence[i].fastener() >= WORTH_MIRRORS)
+        .filter(|&i| evidence[i].fastener() >= WORTH_MORE)
         .collect();
     let centers: Vec<_> = worth.iter().map(|&i| evidence[i].center).collect();
-    let views = MIRRORS.map(|sign| look_once(networks, picture, &centers, sign));
+    let views = VIEWS.map(|sign| look_once(networks, picture, &centers, sign));
     for (k, &i) in worth.iter().enumerate() {
         // a mirror image may have settled on a neighbour
-        let same = |e: &&Evidence| e.center.distance_px(&centers[k]) < VOTE_RADIUS * evidence[i].diameter_px;
-        let mirrored = views.iter().map(|view| &view[k]).filter(same);
-        evidence[i] = mean(&std::iter::once(&evidence[i]).chain(mirrored).collect::<Vec<_>>());
+        let same = |e: &&Evidence| e.center.distance_px(&views[0][k].center) < VOTE_RADIUS * views[0][k].diameter_px;
+        evidence[i] = mean(&views.iter().map(|view| &view[k]).filter(same).collect::<Vec<_>>());
     }
     evidence
 }
@@ -183,10 +221,10 @@ fn look_once(networks: &[Network], picture: &RgbImage, places: &[Pixel<space::Cl
     let mut evidence = Vec::with_capacity(places.len());
     for places in places.chunks(BATCH) {
         let clips: Vec<Clip> = places.iter().map(|&p| Clip::mirrored(picture, p, sign)).collect();
-        let mut batch = Tensor::zeros(clips.len(), CLIP_PX, CLIP_PX, 3);
+        let mut batch = Tensor::zeros(clips.len(), CLIP_PX, CLIP_PX, FINE_INPUT_CHANNELS);
         batch
             .data
-            .par_chunks_mut(CLIP_PX * CLIP_PX * 3)
+            .par_chunks_mut(CLIP_PX * CLIP_PX * FINE_INPUT_CHANNELS)
             .zip(&clips)
             .for_each(|(out, clip)| clip.network_input(out));
         let maps: Vec<Tensor> = networks

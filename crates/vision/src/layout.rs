@@ -5,7 +5,7 @@
 //! | network | input | output channels |
 //! |---|---|---|
 //! | coarse | a whole picture, RGB, [`network_value`] | 2 logits: background, something that may be a fastener's head |
-//! | fine | a clip of 64 x 64 pixels, RGB, gamma corrected ([`crate::Clip::network_input`]) | 7 logits ([`Class`]), then du, dv, ln diameter |
+//! | fine | a clip of 64 x 64 pixels, RGB gamma corrected and local contrast ([`crate::Clip::network_input`]) | 7 logits ([`Class`]), then du, dv, ln diameter |
 
 use std::ops::{Range, RangeInclusive};
 
@@ -31,6 +31,9 @@ pub const CLIP_PX: usize = 64;
 pub const CLIP_CENTER_PX: usize = 32;
 /// Cells along a side of the fine network's output.
 pub const MAP_CELLS: usize = CLIP_PX / STRIDE;
+
+/// Input channels of the fine network: gamma corrected red, green, blue, and the contrast around each pixel.
+pub const FINE_INPUT_CHANNELS: usize = 4;
 
 /// Number of classes.
 pub const CLASSES: usize = 7;
@@ -110,6 +113,7 @@ pub fn cell_center_px(i: usize) -> f64 {
 
 /// The coarse network unless a model file says otherwise: sees 81 x 81 pixels, 45 GFLOP for 12 megapixels.
 pub fn coarse_spec() -> Spec {
+    let conv = LayerSpec::conv;
     Spec {
         input_channels: 3,
         layers: vec![
@@ -119,45 +123,27 @@ pub fn coarse_spec() -> Spec {
             conv(3, 1, 2, 24),
             conv(3, 1, 2, 24),
             conv(3, 1, 4, 24),
-            output(COARSE_CHANNELS),
+            LayerSpec::output(COARSE_CHANNELS),
         ],
     }
 }
 
 /// Each of the three fine networks unless a model file says otherwise: a cell sees 47 x 47 pixels.
 pub fn fine_spec() -> Spec {
+    let conv = LayerSpec::conv;
     Spec {
-        input_channels: 3,
+        input_channels: FINE_INPUT_CHANNELS,
         layers: vec![
             conv(3, 2, 1, 32),
             conv(3, 2, 1, 64),
             conv(3, 1, 1, 64),
-            conv(3, 1, 2, 64),
-            conv(3, 1, 2, 64),
-            output(FINE_CHANNELS),
+            conv(3, 1, 1, 64),
+            conv(3, 2, 1, 128),
+            conv(3, 1, 1, 128),
+            conv(3, 1, 1, 128),
+            LayerSpec::Upsample2,
+            LayerSpec::output(FINE_CHANNELS),
         ],
-    }
-}
-
-fn conv(kernel: usize, stride: usize, dilation: usize, out: usize) -> LayerSpec {
-    LayerSpec::Conv {
-        kernel,
-        stride,
-        dilation,
-        out,
-        batch_norm: true,
-        relu: true,
-    }
-}
-
-fn output(out: usize) -> LayerSpec {
-    LayerSpec::Conv {
-        kernel: 1,
-        stride: 1,
-        dilation: 1,
-        out,
-        batch_norm: false,
-        relu: false,
     }
 }
 

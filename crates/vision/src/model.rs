@@ -10,7 +10,7 @@ use nn::{Network, NnError};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
-use crate::layout::{CLIP_PX, COARSE_CHANNELS, FINE_CHANNELS, STRIDE};
+use crate::layout::{CLIP_PX, COARSE_CHANNELS, FINE_CHANNELS, FINE_INPUT_CHANNELS, STRIDE};
 
 const MAGIC: &[u8; 7] = b"UNSCREW";
 /// Version of the container, the eighth byte of the file.
@@ -69,10 +69,19 @@ pub struct Corrections {
     pub depth_rise: [f64; 2],
     /// True error over stated sigma of the depth at the rim.
     pub depth_sigma: f64,
-    /// Slope of the score in log odds (Platt 1999).
-    pub score_slope: f64,
-    /// Offset of the score in log odds.
-    pub score_offset: f64,
+    /// What makes a probability `p` of the networks true: its log odds are `a ln p - b ln(1 - p) + c` (beta calibration, Kull, Silva
+    /// Filho and Flach 2017); `[a, b, c]`.
+    pub score: [f64; 3],
+}
+
+impl Corrections {
+    /// The networks' probability, corrected.
+    pub fn probability(&self, p: f64) -> f64 {
+        let p = p.clamp(1e-7, 1.0 - 1e-7);
+        let [a, b, c] = self.score;
+        let log_odds = a * p.ln() - b * (1.0 - p).ln() + c;
+        1.0 / (1.0 + (-log_odds).exp())
+    }
 }
 
 impl Default for Corrections {
@@ -85,8 +94,7 @@ impl Default for Corrections {
             fused_sigma: 1.0,
             depth_rise: [0.0; 2],
             depth_sigma: 1.0,
-            score_slope: 1.0,
-            score_offset: 0.0,
+            score: [1.0, 1.0, 0.0],
         }
     }
 }
@@ -236,8 +244,12 @@ impl Model {
                 source,
             })?;
             let is_coarse = entry.name == "coarse";
-            let channels = if is_coarse { COARSE_CHANNELS } else { FINE_CHANNELS };
-            check_shape(&network, channels).map_err(|reason| ModelError::Shape {
+            let (inputs, outputs) = if is_coarse {
+                (3, COARSE_CHANNELS)
+            } else {
+                (FINE_INPUT_CHANNELS, FINE_CHANNELS)
+            };
+            check_shape(&network, inputs, outputs).map_err(|reason| ModelError::Shape {
                 file: file.into(),
                 network: entry.name.clone(),
                 reason,
@@ -358,17 +370,19 @@ fn split<'a>(bytes: &'a [u8], file: &str) -> Result<(Header, &'a [u8]), ModelErr
     Ok((header, &bytes[end..]))
 }
 
-fn check_shape(network: &Network, channels: usize) -> Result<(), String> {
+fn check_shape(network: &Network, inputs: usize, outputs: usize) -> Result<(), String> {
     let spec = network.spec();
-    if spec.input_channels != 3 || spec.output_channels() != channels {
+    if spec.input_channels != inputs || spec.output_channels() != outputs {
         return Err(format!(
-            "has {} input and {} output channels, expected are 3 and {channels}",
+            "has {} input and {} output channels, expected are {inputs} and {outputs}",
             spec.input_channels,
             spec.output_channels()
         ));
     }
     let cells = CLIP_PX / STRIDE;
-    if spec.pixel_map() != (STRIDE as f64, 0.0) || spec.output_size(CLIP_PX, CLIP_PX) != (cells, cells) {
+    // a network that ends with an enlargement has its cells half a cell off, and learns to answer for where they should be
+    let (scale, offset) = spec.pixel_map();
+    if scale != STRIDE as f64 || offset.abs() > 0.5 * scale || spec.output_size(CLIP_PX, CLIP_PX) != (cells, cells) {
         return Err(format!("does not have one output on every {STRIDE}th pixel"));
     }
     Ok(())

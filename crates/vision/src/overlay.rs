@@ -104,6 +104,7 @@ mod tests {
             sigma_px: 0.2,
             diameter_px: 30.0,
             score: 0.98,
+            fits: 0.98,
             drive: Drive::Cross,
             verdict: Verdict::Screw,
             cues: vec![],

@@ -154,6 +154,7 @@ mod tests {
             sigma_px: 0.2,
             diameter_px: 37.4,
             score: 0.998,
+            fits: 0.998,
             drive: Drive::Cross,
             verdict: Verdict::Screw,
             cues: vec![Cue::Learned, Cue::Cross],

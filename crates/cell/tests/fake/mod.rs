@@ -193,7 +193,7 @@ pub fn map() -> Map {
             let camera = base_from_camera().inverse() * t.command;
             Pair {
                 id: t.id,
-                node: Some(t.node),
+                node: t.node,
                 t_s: 0.0,
                 command: t.command,
                 pixel: self::camera().project(camera),
@@ -298,7 +298,7 @@ impl DepthCamera for FakeDepth {
 }
 
 impl Finder for Fake {
-    fn find(&self, frame: &RgbdFrame) -> Vec<vision::Screw> {
+    fn find(&self, frame: &RgbdFrame, _odds: f64) -> Vec<vision::Screw> {
         let world = self.world();
         let tilt = world.tilt_rad.get(&world.presented).copied().unwrap_or(0.0);
         let lean = world.lean_rad.get(&world.presented).copied().unwrap_or(0.0);
@@ -315,6 +315,7 @@ impl Finder for Fake {
                     sigma_px: 0.2,
                     diameter_px: 9.0 / part.pixel_mm(point.z_mm()),
                     score: 0.95,
+                    fits: 0.95,
                     drive: vision::Drive::Cross,
                     verdict: head.verdict,
                     cues: Vec::new(),

@@ -12,6 +12,7 @@ use serde::{Deserialize, Serialize};
 use vision::layout::TRAINED_HEAD_PX;
 use vision::{Detections, Detector, Drive, Options, Screw, Timing, Verdict, candidates, coarse_map};
 
+use super::scores::{CurvePoint, ReliabilityBin, Scores};
 use super::{
     Coverage, EvaluateError, FalseFind, Miss, Quantiles, Share, cut, list, percent, read_text, speaker, unreadable,
     word, write_lists,
@@ -146,6 +147,10 @@ pub struct Evaluation {
     pub by_drive: BTreeMap<String, DriveRow>,
     /// Reported fasteners of other drives whose drive is right.
     pub drive_right: Rate,
+    /// Probabilities of a cross screw as said, beside what is so.
+    pub reliability: Vec<ReliabilityBin>,
+    /// What other thresholds would give.
+    pub curve: Vec<CurvePoint>,
     /// Detectable screws not found, at most 200.
     pub misses: Vec<Miss>,
     /// False finds, at most 200.
@@ -351,6 +356,8 @@ impl<'a> Evaluator<'a> {
                 locate: timings(|t| t.locate),
                 total: timings(|t| t.total),
             },
+            reliability: t.scores.reliability(),
+            curve: t.scores.curve(t.pictures),
             by_wear: rates(t.by_wear),
             by_head: rates(t.by_head),
             by_plating: rates(t.by_plating),
@@ -490,6 +497,7 @@ struct Tally {
     misses: Vec<Miss>,
     false_list: Vec<FalseFind>,
     timings: Vec<Timing>,
+    scores: Scores,
 }
 
 impl Tally {
@@ -508,6 +516,7 @@ impl Tally {
             let acted = finds().filter(|f| f.verdict == Verdict::Screw).count();
             self.repeated += acted.saturating_sub(1);
             if screw.detectable {
+                self.scores.screw(finds().map(|f| f.fits).fold(0.0, f64::max));
                 let near = |p: &Pixel| p.distance_px(&screw.pixel) <= ON_SCREW * screw.head_d_px;
                 let candidate = places.map(|places| places.iter().any(near));
                 self.screw(truth, screw, speaker(finds(), screw.pixel), candidate);
@@ -521,6 +530,10 @@ impl Tally {
             }
         }
         for (find, subject) in found.screws.iter().zip(&subjects) {
+            // of screws that nobody can make out nothing is expected
+            if !matches!(subject, Subject::Screw(k) if !truth.screws[*k].detectable) {
+                self.scores.find(find.fits, matches!(subject, Subject::Screw(_)));
+            }
             let kind = match *subject {
                 Subject::Screw(_) => continue,
                 Subject::Decoy(k) => truth.decoys[k].kind.as_str(),
@@ -796,6 +809,20 @@ impl Display for Evaluation {
             }
         }
 
+        writeln!(
+            f,
+            "\n{:<22} {:>6} {:>9} {:>9}",
+            "said to be cross", "n", "said %", "is %"
+        )?;
+        for bin in &self.reliability {
+            let (range, is) = (format!("{:.1} to {:.1}", bin.low, bin.high), percent(bin.cross.rate, 1));
+            writeln!(
+                f,
+                "  {range:<20} {:>6} {:>9.1} {is:>9}",
+                bin.cross.of,
+                100.0 * bin.said_mean
+            )?;
+        }
         write_rates(f, "by wear", &self.by_wear)?;
         write_rates(f, "by head", &self.by_head)?;
         write_rates(f, "by plating", &self.by_plating)?;

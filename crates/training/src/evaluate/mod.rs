@@ -7,6 +7,7 @@
 mod crops;
 mod faces;
 mod photographs;
+mod scores;
 
 pub use crops::{CropEvaluation, evaluate_crops};
 pub use faces::{
@@ -14,6 +15,7 @@ pub use faces::{
     evaluate_truth_folder, truth_files,
 };
 pub use photographs::{PhotoEvaluation, SceneRow, evaluate_yolo_folder};
+pub use scores::{CurvePoint, ReliabilityBin};
 
 use std::fmt::{self, Formatter};
 use std::path::{Path, PathBuf};
@@ -301,6 +303,7 @@ mod tests {
             sigma_px: 0.5,
             diameter_px: 30.0,
             score: 0.9,
+            fits: 0.9,
             drive,
             verdict,
             cues: Vec::new(),

@@ -1,0 +1,77 @@
+//! Training as its users meet it: the same file for the same settings, also after a stop; damage is named.
+
+use std::{fs, path::Path};
+use training::{Progress, TrainError, TrainSettings, train};
+
+struct Silent;
+impl Progress for Silent {
+    fn report(&self, _: &str, _: u64, _: u64, _: Option<f32>) {}
+}
+
+fn tiny(work: Option<&Path>) -> TrainSettings {
+    TrainSettings {
+        units: 1,
+        background: 1,
+        batch: 8,
+        coarse_steps: 4,
+        fine_steps: 4,
+        shared_steps: 2,
+        tuning_faces: 0,
+        work: work.map(Path::to_owned),
+        data: Path::new(env!("CARGO_MANIFEST_DIR")).join("data"),
+        ..TrainSettings::default()
+    }
+}
+
+#[test]
+fn a_training_that_was_stopped_ends_with_the_same_bytes() -> Result<(), Box<dyn std::error::Error>> {
+    let folder = tempfile::tempdir()?;
+    let (work, out) = (folder.path().join("work"), folder.path().join("model.unscrew"));
+    fs::create_dir(&work)?;
+    train(&tiny(None), &out, &Silent)?;
+    let in_one_go = fs::read(&out)?;
+    let report = train(&tiny(Some(&work)), &out, &Silent)?;
+    assert_eq!(fs::read(&out)?, in_one_go);
+    // as a stop leaves it: the third network not begun, one unit's patches not yet written
+    let gone: Vec<_> = fs::read_dir(&work)?
+        .filter_map(Result::ok)
+        .filter(|f| {
+            f.file_name()
+                .to_str()
+                .is_some_and(|n| n.starts_with("fine2") || n.ends_with(".patches"))
+        })
+        .collect();
+    assert_eq!(gone.len(), 2, "{gone:?}");
+    for file in gone {
+        fs::remove_file(file.path())?;
+    }
+    let again = train(&tiny(Some(&work)), &out, &Silent)?;
+    assert_eq!(fs::read(&out)?, in_one_go);
+    assert_eq!(again.loss, report.loss);
+    assert!(
+        again.loss.len() == 5 && again.loss.values().all(|l| l.is_finite()),
+        "{:?}",
+        again.loss
+    );
+    Ok(())
+}
+
+#[test]
+fn a_damaged_work_folder_is_named() -> Result<(), Box<dyn std::error::Error>> {
+    let folder = tempfile::tempdir()?;
+    let out = folder.path().join("model.unscrew");
+    for name in ["unit-000000-1.patches", "coarse"] {
+        train(&tiny(Some(folder.path())), &out, &Silent)?;
+        let file = fs::read_dir(folder.path())?
+            .filter_map(Result::ok)
+            .find(|f| f.file_name().to_string_lossy().starts_with(name))
+            .ok_or("the file is there")?;
+        fs::write(file.path(), b"not what training wrote")?;
+        match train(&tiny(Some(folder.path())), &out, &Silent) {
+            Err(TrainError::Damaged { path }) => assert_eq!(path, file.path()),
+            other => return Err(format!("{name}: {other:?}").into()),
+        }
+        fs::remove_file(file.path())?;
+    }
+    Ok(())
+}
