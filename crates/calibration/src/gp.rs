@@ -20,6 +20,8 @@ pub(crate) const MOST_POINTS: usize = 400;
 const MAX_SCORE: f64 = 4.0;
 /// Rounds of rejection.
 const ROUNDS: usize = 6;
+/// A map that is as sure as this is sure enough, however well the camera measures, mm.
+const SURE_MM: f64 = 0.01;
 /// Distance of the nodes of the baked correction, mm; of its variance, twice that.
 const NODE_MM: f64 = 40.0;
 /// How far beyond the points the correction is baked, mm.
@@ -75,7 +77,7 @@ impl Kernel {
         let kernel = |x: &Vector3<f64>| Self {
             smooth_mm: x[0].clamp(-7.0, 3.0).exp(),
             length_mm: x[1].clamp(3.5, 9.0).exp(),
-            noise_mm: x[2].clamp(-7.0, 2.0).exp(),
+            noise_mm: x[2].exp().clamp(crate::lattice::FLOOR_MM, 10.0),
         };
         let at = Vector3::new(start.smooth_mm.ln(), start.length_mm.ln(), start.noise_mm.ln());
         kernel(&simplex(|x| kernel(x).cost(places, components), at, trials))
@@ -538,7 +540,10 @@ impl Gp {
         let variance = self.linear(place);
         Answer {
             base,
-            leverage: (variance[0] / self.noise_mm[0].powi(2)).max(variance[1] / self.noise_mm[1].powi(2)),
+            leverage: [0, 1]
+                .map(|c| variance[c] / self.noise_mm[c].max(SURE_MM).powi(2))
+                .into_iter()
+                .fold(0.0, f64::max),
             sigma_mm: [0, 1].map(|c| self.scale[c] * (variance[c] + self.noise_mm[c].powi(2)).sqrt()),
         }
     }

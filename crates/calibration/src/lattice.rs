@@ -560,7 +560,7 @@ pub(crate) fn split(error: Vector3<f64>, ray: Vector3<f64>) -> (f64, f64) {
 /// Scores below which a pair is believed; a Gaussian error exceeds either in one of 100,000.
 const MAX_SCORE: f64 = 4.5;
 /// No camera measures better than this, mm: keeps perfect data from being judged by its rounding.
-const FLOOR_MM: f64 = 2e-3;
+pub(crate) const FLOOR_MM: f64 = 2e-3;
 
 /// Decides which points to believe: each is predicted from its neighbours by a robust local fit, and rejected if it lies too
 /// far off, across or along the viewing ray. Returns a flag for each.

@@ -108,7 +108,9 @@ impl Clip {
             for (to, &from) in to.iter_mut().zip(from) {
                 *to = table[usize::from(from)];
             }
-            luma.push(0.3 * to[0] + 0.6 * to[1] + 0.1 * to[2]);
+            // as measured: the correction for a bright panel leaves nothing of a black head's recess
+            let [r, g, b] = [from[0], from[1], from[2]].map(network_value);
+            luma.push(0.3 * r + 0.6 * g + 0.1 * b);
         }
         let contrast = local_contrast(&luma);
         for (to, contrast) in out.chunks_exact_mut(FINE_INPUT_CHANNELS).zip(contrast) {
@@ -117,7 +119,7 @@ impl Clip {
     }
 }
 
-/// How far each pixel's luminance is from the mean of the pixels around it, in their standard deviations: a recess in a black head
+/// How far each pixel's luminance, as measured, is from the mean of the pixels around it, in their standard deviations: a recess in a black head
 /// looks as one in a bright head does.
 fn local_contrast(luma: &[f32]) -> Vec<f32> {
     const SIDE: usize = CLIP_PX + 1;
