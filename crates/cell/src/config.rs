@@ -91,7 +91,7 @@ pub struct Inspection {
     /// A screw seen within this distance of a target is that target, mm.
     pub same_screw_mm: f64,
     /// How much likelier a doubtful head is a screw once the cover that it may hold has not come off: a missed screw always holds
-    /// it, and of covers without one about one in ten jams.
+    /// it, and of covers without one about one in fifty jams.
     pub stuck_cover_odds: f64,
     /// Time that is budgeted for computing on a picture, s per megapixel. Only a simulated clock needs it.
     pub vision_s_per_mpx: f64,
@@ -105,7 +105,7 @@ impl Default for Inspection {
             depth_frames: 1,
             second_look_mm: 32.0,
             same_screw_mm: 4.0,
-            stuck_cover_odds: 10.0,
+            stuck_cover_odds: 50.0,
             vision_s_per_mpx: 0.05,
         }
     }
@@ -180,6 +180,10 @@ pub struct Drive {
     pub after_cam_out: DriveProgram,
     /// Once more after the screw did not turn: a longer burst.
     pub after_seized: DriveProgram,
+    /// Places around a screw that the camera sees and the bit does not meet; 0: none.
+    pub search_steps: u32,
+    /// How far from it they are, mm: the bit's cone reaches 0.75 mm.
+    pub search_mm: f64,
 }
 
 impl Default for Drive {
@@ -202,6 +206,8 @@ impl Default for Drive {
                 axial_force_n: 200.0,
                 ..first
             },
+            search_steps: 6,
+            search_mm: 0.8,
         }
     }
 }

@@ -69,6 +69,16 @@ impl SafeTarget {
         })
     }
 
+    /// A place so far beside it, across the approach, along the tool's axes; `None` if that or the way to it leaves the volume.
+    pub fn beside(&self, map: &Map, across_mm: [f64; 2]) -> Option<Self> {
+        let tool = tool_pose(self.tip, self.approach);
+        let tip = tool * Point::new(across_mm[0], across_mm[1], 0.0);
+        let moved = Self { tip, ..*self };
+        let start = tip.moved(self.approach, -self.standoff_mm);
+        let volume = map.volume();
+        (volume.contains(tip) && volume.contains(start)).then_some(moved)
+    }
+
     /// Number of the arm.
     pub fn arm(&self) -> usize {
         self.arm

@@ -591,8 +591,32 @@ impl Way<'_> {
             }
             Retry::LookAgain(program) => {
                 if let Some((place, picture)) = self.second_look(target, shot).await? {
-                    self.burst(target.found, place, program, Some(picture)).await?;
+                    let end = self.burst(target.found, place, program, Some(picture)).await?;
+                    self.search(target.found, place, program, end).await?;
                 }
+            }
+        }
+        Ok(())
+    }
+
+    /// Where the camera still sees a screw but the bit met none: once around the place, farther out than its cone reaches.
+    async fn search(
+        &mut self,
+        found: usize,
+        place: SafeTarget,
+        program: DriveProgram,
+        mut end: Option<DriveEnd>,
+    ) -> Result<(), Stop> {
+        let drive = self.runner.config.drive;
+        for step in 0..drive.search_steps {
+            if end != Some(DriveEnd::MissedHead) {
+                break;
+            }
+            let angle = std::f64::consts::TAU * f64::from(step) / f64::from(drive.search_steps);
+            let across_mm = [drive.search_mm * angle.cos(), drive.search_mm * angle.sin()];
+            let map = self.runner.maps.get(place.arm());
+            if let Some(beside) = map.and_then(|map| place.beside(map, across_mm)) {
+                end = self.burst(found, beside, program, None).await?;
             }
         }
         Ok(())

@@ -368,6 +368,42 @@ fn a_stuck_cover_settles_the_doubt_about_a_head() {
 }
 
 #[test]
+fn a_screw_that_is_seen_but_not_met_is_searched_for_around_its_place() {
+    // every centre is off by more than the bit's cone reaches
+    struct Off(Fake);
+    impl cell::run::Finder for Off {
+        fn find(&self, frame: &geometry::RgbdFrame, odds: f64) -> Vec<vision::Screw> {
+            let mut found = self.0.find(frame, odds);
+            for screw in &mut found {
+                screw.camera = screw
+                    .camera
+                    .map(|p| geometry::Point::new(p.x_mm() + 1.2, p.y_mm(), p.z_mm()));
+            }
+            found
+        }
+        fn model(&self) -> String {
+            "off".into()
+        }
+    }
+    let fake = Fake::new(&[("front", vec![screw(10.0, 20.0)])]);
+    let folder = tempfile::tempdir().expect("folder");
+    let mut runner = Runner::new(
+        fake.devices(),
+        Arc::new(Off(fake.clone())),
+        vec![map()],
+        Program::paper().expect("built-in program"),
+        CellConfig::simulated(),
+        Journal::open(folder.path()).expect("journal"),
+    )
+    .expect("runner");
+    let record = block_on(runner.run_unit(&Silent)).expect("a record");
+    assert_eq!(record.outcome, Some(Outcome::Ok));
+    assert_eq!((fake.standing(), record.screws_out()), (0, 1));
+    let drives = fake.calls("drive");
+    assert!((3..=8).contains(&drives), "{drives} bursts");
+}
+
+#[test]
 fn after_a_crash_in_a_burst_the_program_looks_and_repeats_nothing() {
     for took_effect in [true, false] {
         let (fake, folder) = (Fake::whole(), tempfile::tempdir().expect("folder"));

@@ -171,11 +171,11 @@ fn plan(args: &Plan) -> Result<Ended> {
 fn capture(args: &Capture) -> Result<Ended> {
     let done = crate::run::capture_pairs(args.cell_seed, &args.arm, &args.visits, &args.out)?;
     println!(
-        "{}: {} visits, marker found at {}, {:.1} simulated hours",
+        "{}: {} visits, marker found at {}, {:.0} simulated minutes",
         args.out.display(),
         done.visits,
         done.found,
-        done.cell_s / 3600.0
+        done.cell_s / 60.0
     );
     Ok(Ended::Good)
 }

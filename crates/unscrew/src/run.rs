@@ -198,7 +198,7 @@ async fn calibrated(
         bench.mount_jig(Some(k));
         let started_s = bench.devices.clock.now_s();
         capture_with(&bench, k, &args.visits, &pairs, stop).await?;
-        let hours = (bench.devices.clock.now_s() - started_s) / 3600.0;
+        let minutes = (bench.devices.clock.now_s() - started_s) / 60.0;
         let settings = Settings {
             identity,
             date: output::now_utc(),
@@ -207,7 +207,7 @@ async fn calibrated(
         let (map, report) = Map::fit(&read_pairs(&pairs)?, &settings)?;
         map.save(&path)?;
         let note = format!(
-            "{name}: {} pairs in {hours:.1} simulated hours, {} without marker, {} rejected; held out rms {:.3} mm, p99.9 {:.3} mm",
+            "{name}: {} pairs in {minutes:.0} simulated minutes, {} without marker, {} rejected; held out rms {:.3} mm, p99.9 {:.3} mm",
             report.n_used,
             report.n_invalid,
             report.rejected.len(),
