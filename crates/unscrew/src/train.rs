@@ -11,7 +11,7 @@ use std::{
 use training::{Progress, TrainSettings, train};
 
 /// Trains the detector's four networks from rendered faces and the real photographs in the repository; the same file for the same
-/// settings. About an hour on 2 cores.
+/// settings. About an hour and a half on 2 cores.
 #[derive(clap::Args)]
 #[command(after_help = "Example: unscrew train --out model.unscrew\nThen:    unscrew evaluate --model model.unscrew")]
 pub struct Args {

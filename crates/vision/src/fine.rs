@@ -465,12 +465,41 @@ mod tests {
             let gamma = Clip::cut(&picture, at).gamma();
             assert!((gamma - expected).abs() < 0.05, "{value}: {gamma}");
         }
-        let mut input = vec![0f32; CLIP_PX * CLIP_PX * 3];
+        let mut input = vec![0f32; CLIP_PX * CLIP_PX * FINE_INPUT_CHANNELS];
         Clip::cut(&RgbImage::from_pixel(80, 80, image::Rgb([60; 3])), at).network_input(&mut input);
+        for pixel in input.chunks_exact(FINE_INPUT_CHANNELS) {
+            assert!(
+                pixel[..3].iter().all(|v| (v - (2.0 * 0.45 - 1.0)).abs() < 0.05) && pixel[3].abs() < 1e-3,
+                "{pixel:?}"
+            );
+        }
+    }
+
+    #[test]
+    fn the_recess_of_a_black_head_is_seen_as_that_of_a_bright_one() {
+        // a bright panel, a head with a ring as recess, four levels or forty darker than the head
+        let contrast = |head: u8, recess: u8| {
+            let picture = RgbImage::from_fn(80, 80, |x, y| {
+                let r = (f64::from(x) - 40.0).hypot(f64::from(y) - 40.0);
+                image::Rgb(
+                    [if r > 24.0 {
+                        210
+                    } else if (4.0..7.0).contains(&r) {
+                        recess
+                    } else {
+                        head
+                    }; 3],
+                )
+            });
+            let mut input = vec![0f32; CLIP_PX * CLIP_PX * FINE_INPUT_CHANNELS];
+            Clip::cut(&picture, Pixel::new(40.0, 40.0)).network_input(&mut input);
+            let at = |x: usize| input[(CLIP_CENTER_PX * CLIP_PX + x) * FINE_INPUT_CHANNELS + 3];
+            at(CLIP_CENTER_PX) - at(CLIP_CENTER_PX + 5)
+        };
+        let (bright, black, none) = (contrast(160, 120), contrast(20, 14), contrast(20, 20));
         assert!(
-            input.iter().all(|v| (v - (2.0 * 0.45 - 1.0)).abs() < 0.05),
-            "{}",
-            input[0]
+            bright > 1.5 && black > 0.4 * bright && none.abs() < 0.01,
+            "{bright} {black} {none}"
         );
     }
 }

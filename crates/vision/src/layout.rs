@@ -1,6 +1,7 @@
 //! What the networks see and what their outputs mean: the one place that training and detection share.
 //!
-//! Both networks have stride 4 and unpadded centres: output cell `i` is centred on input pixel `4 * i`.
+//! Both networks answer at every fourth pixel: output cell `i` speaks of input pixel `4 * i` (the fine one halves once more and
+//! enlarges at its end; it has learned the half cell by which that is off).
 //!
 //! | network | input | output channels |
 //! |---|---|---|
@@ -128,7 +129,7 @@ pub fn coarse_spec() -> Spec {
     }
 }
 
-/// Each of the three fine networks unless a model file says otherwise: a cell sees 47 x 47 pixels.
+/// Each of the three fine networks unless a model file says otherwise: a cell sees 71 x 71 pixels.
 pub fn fine_spec() -> Spec {
     let conv = LayerSpec::conv;
     Spec {
@@ -161,7 +162,7 @@ mod tests {
         assert_eq!(fine.output_size(CLIP_PX, CLIP_PX), (MAP_CELLS, MAP_CELLS));
         assert_eq!(coarse.output_channels(), COARSE_CHANNELS);
         assert_eq!(fine.output_channels(), FINE_CHANNELS);
-        assert_eq!((coarse.receptive_field(), fine.receptive_field()), (81, 47));
+        assert_eq!((coarse.receptive_field(), fine.receptive_field()), (81, 71));
         assert!(coarse.flops(3006, 4104) < 60_000_000_000);
         assert_eq!(cell_center_px(8), CLIP_CENTER_PX as f64);
         assert_eq!(Class::ALL.map(Class::channel), [0, 1, 2, 3, 4, 5, 6]);
