@@ -34,7 +34,7 @@ pub struct Trial {
 /// Trains one network of stage 2 on the rendered patches of `settings` and measures it on those of `units` units of the tuning seeds.
 ///
 /// # Errors
-/// As [`train`].
+/// As [`train`](crate::train()).
 pub fn try_network(
     spec: Spec,
     settings: &TrainSettings,
@@ -70,7 +70,7 @@ pub fn try_network(
 /// What networks of stage 2 say of the patches of units, for instance to compare those that they learned from with others.
 ///
 /// # Errors
-/// As [`train`], for the work folder.
+/// As [`train`](crate::train()), for the work folder.
 pub fn measure_networks(
     networks: &[Network],
     units: Range<u64>,
