@@ -29,14 +29,14 @@ const WARM_UP: usize = 100;
 /// Weight of the places in the last quarter of the steps, when the classes are nearly learned, against that before.
 const LATE_PLACE: f32 = 4.0;
 /// What decides beside the settings what a network learns: a network half trained by another recipe is not gone on with.
-const RECIPE: &str = include_str!("batch.rs");
+const RECIPE: [&str; 2] = [include_str!("batch.rs"), include_str!("../../vision/src/clip.rs")];
 /// Steps after which a network is written to the work folder.
 const KEEP_EVERY: usize = 500;
 
 /// Why training could not be done.
 #[derive(Debug, thiserror::Error)]
 pub enum TrainError {
-    /// A file of the real photographs could not be read.
+    /// A file of the real photographs, of the work folder or of the model to go on from could not be read.
     #[error("cannot read {path}: {source}; run from the repository's root, or give the folder of the training data")]
     Data {
         /// The file.
@@ -367,9 +367,11 @@ impl Lesson<'_> {
         });
         let mut mean_loss = f32::NAN;
         if let Some(path) = kept.as_ref().filter(|p| p.exists()) {
-            let damaged = || TrainError::Damaged { path: path.clone() };
-            let bytes = std::fs::read(path).map_err(|_| damaged())?;
-            trainer = Trainer::from_bytes(&bytes).map_err(|_| damaged())?;
+            let bytes = std::fs::read(path).map_err(|source| TrainError::Data {
+                path: path.clone(),
+                source,
+            })?;
+            trainer = Trainer::from_bytes(&bytes).map_err(|_| TrainError::Damaged { path: path.clone() })?;
             let loss = nn::metadata(&bytes).ok().and_then(|m| m.get("loss")?.parse().ok());
             mean_loss = loss.unwrap_or(f32::NAN);
         }

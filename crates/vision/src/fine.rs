@@ -5,23 +5,18 @@ use image::RgbImage;
 use nn::{Network, Tensor, softmax};
 use rayon::prelude::*;
 
+use crate::clip::Clip;
 use crate::layout::{
-    CLASS_CHANNELS, CLASSES, CLIP_CENTER_PX, CLIP_PX, Class, FINE_CHANNELS, FINE_INPUT_CHANNELS, LN_DIAMETER,
-    MAP_CELLS, NOMINAL_HEAD_PX, OFFSET_U, OFFSET_UNIT_PX, OFFSET_V, TRAINED_HEAD_PX, cell_center_px, network_value,
+    CLASS_CHANNELS, CLASSES, CLIP_PX, Class, FINE_CHANNELS, FINE_INPUT_CHANNELS, LN_DIAMETER, MAP_CELLS,
+    NOMINAL_HEAD_PX, OFFSET_U, OFFSET_UNIT_PX, OFFSET_V, TRAINED_HEAD_PX, cell_center_px,
 };
 
-/// Luminance (0 to 1, sRGB) that the gamma correction gives a clip's median.
-const MEDIAN_LUMA: f64 = 0.45;
 /// Votes farther than this from the centre belong to something else, in head diameters.
 const VOTE_RADIUS: f64 = 0.5;
 /// Radius of the disc whose mean decides about the class, in head diameters.
 const DECISION_RADIUS: f64 = 0.25;
 /// Neighbouring cells see nearly the same pixels: so many of them count as one independent vote.
 const CELLS_A_VOTE: f64 = 4.0;
-/// Half side of the square in which a pixel's contrast is measured, px: about a recess.
-const CONTRAST_REACH_PX: usize = 9;
-/// Contrast that is as good as none (of 2): noise is not to look like a recess.
-const CONTRAST_FLOOR: f32 = 0.03;
 /// Clips that go through the networks at once: bounds the memory.
 const BATCH: usize = 64;
 
@@ -29,130 +24,6 @@ const BATCH: usize = 64;
 const WORTH_MORE: f32 = 0.05;
 /// The clip as it is, and its mirror images: signs along u and v. The networks' errors differ between them.
 const VIEWS: [[i64; 2]; 4] = [[1, 1], [-1, 1], [1, -1], [-1, -1]];
-
-/// A square of the picture around a candidate; outside the picture its border is repeated.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Clip {
-    /// Picture pixel under clip pixel [`CLIP_CENTER_PX`].
-    middle: [i64; 2],
-    /// Picture pixels per clip pixel along each axis: 1, or -1 where mirrored.
-    sign: [i64; 2],
-    rgb: Vec<u8>,
-}
-
-impl Clip {
-    /// Cuts a clip of [`CLIP_PX`] a side such that `center`, rounded, is its pixel [`CLIP_CENTER_PX`].
-    pub fn cut(picture: &RgbImage, center: Pixel<space::Clip>) -> Self {
-        Self::mirrored(picture, center, [1, 1])
-    }
-
-    /// As [`cut`](Self::cut), mirrored about that pixel along the axes whose sign is -1.
-    fn mirrored(picture: &RgbImage, center: Pixel<space::Clip>, sign: [i64; 2]) -> Self {
-        let middle = [center.u_px, center.v_px].map(|c| c.round() as i64);
-        let (width, height) = (i64::from(picture.width()), i64::from(picture.height()));
-        let mut rgb = Vec::with_capacity(CLIP_PX * CLIP_PX * 3);
-        let raw = picture.as_raw();
-        let source = |axis: usize, c: i64, size: i64| {
-            (middle[axis] + sign[axis] * (c - CLIP_CENTER_PX as i64)).clamp(0, size - 1)
-        };
-        for y in 0..CLIP_PX as i64 {
-            let v = source(1, y, height);
-            for x in 0..CLIP_PX as i64 {
-                let at = 3 * (v * width + source(0, x, width)) as usize;
-                rgb.extend_from_slice(&raw[at..at + 3]);
-            }
-        }
-        Self { middle, sign, rgb }
-    }
-
-    /// Where a place of the picture lies in the clip.
-    fn to_clip(&self, place: Pixel<space::Clip>) -> [f64; 2] {
-        let along =
-            |axis: usize, c: f64| CLIP_CENTER_PX as f64 + self.sign[axis] as f64 * (c - self.middle[axis] as f64);
-        [along(0, place.u_px), along(1, place.v_px)]
-    }
-
-    /// Where a place of the clip lies in the picture.
-    fn to_picture(&self, place: Pixel<space::Clip>) -> Pixel<space::Clip> {
-        let along =
-            |axis: usize, c: f64| self.middle[axis] as f64 + self.sign[axis] as f64 * (c - CLIP_CENTER_PX as f64);
-        Pixel::new(along(0, place.u_px), along(1, place.v_px))
-    }
-
-    /// The exponent that brings the clip's median luminance to 0.45, between 0.4 and 2.5.
-    pub fn gamma(&self) -> f64 {
-        let mut histogram = [0usize; 256];
-        for pixel in self.rgb.chunks_exact(3) {
-            let [r, g, b] = [pixel[0], pixel[1], pixel[2]].map(u32::from);
-            histogram[((54 * r + 183 * g + 19 * b) >> 8) as usize] += 1;
-        }
-        let (mut below, mut median) = (0, 0);
-        while below + histogram[median] <= CLIP_PX * CLIP_PX / 2 && median < 255 {
-            below += histogram[median];
-            median += 1;
-        }
-        let median = (median as f64 / 255.0).clamp(0.01, 0.99);
-        (MEDIAN_LUMA.ln() / median.ln()).clamp(0.4, 2.5)
-    }
-
-    /// What the fine network sees, row by row: RGB, gamma corrected, -1 to 1, then the local contrast; `out` has [`CLIP_PX`]² x
-    /// [`FINE_INPUT_CHANNELS`] values.
-    pub fn network_input(&self, out: &mut [f32]) {
-        let gamma = self.gamma();
-        let table: [f32; 256] = std::array::from_fn(|v| {
-            let corrected = 255.0 * (v as f64 / 255.0).powf(gamma);
-            network_value(corrected.round() as u8)
-        });
-        let mut luma = Vec::with_capacity(CLIP_PX * CLIP_PX);
-        for (to, from) in out.chunks_exact_mut(FINE_INPUT_CHANNELS).zip(self.rgb.chunks_exact(3)) {
-            for (to, &from) in to.iter_mut().zip(from) {
-                *to = table[usize::from(from)];
-            }
-            // as measured: the correction for a bright panel leaves nothing of a black head's recess
-            let [r, g, b] = [from[0], from[1], from[2]].map(network_value);
-            luma.push(0.3 * r + 0.6 * g + 0.1 * b);
-        }
-        let contrast = local_contrast(&luma);
-        for (to, contrast) in out.chunks_exact_mut(FINE_INPUT_CHANNELS).zip(contrast) {
-            to[3] = contrast;
-        }
-    }
-}
-
-/// How far each pixel's luminance, as measured, is from the mean of the pixels around it, in their standard deviations: a recess in a black head
-/// looks as one in a bright head does.
-fn local_contrast(luma: &[f32]) -> Vec<f32> {
-    const SIDE: usize = CLIP_PX + 1;
-    let mut sums = vec![[0f32; 2]; SIDE * SIDE]; // of luminance and its square, over all pixels above and to the left
-    for y in 0..CLIP_PX {
-        let mut row = [0f32; 2];
-        for x in 0..CLIP_PX {
-            let value = luma[y * CLIP_PX + x];
-            row = [row[0] + value, row[1] + value * value];
-            let above = sums[y * SIDE + x + 1];
-            sums[(y + 1) * SIDE + x + 1] = [row[0] + above[0], row[1] + above[1]];
-        }
-    }
-    let ends = |c: usize| {
-        (
-            c.saturating_sub(CONTRAST_REACH_PX),
-            (c + CONTRAST_REACH_PX + 1).min(CLIP_PX),
-        )
-    };
-    let pixels = (0..CLIP_PX * CLIP_PX).map(|i| (i / CLIP_PX, i % CLIP_PX));
-    pixels
-        .map(|(y, x)| {
-            let ((top, bottom), (left, right)) = (ends(y), ends(x));
-            let n = ((bottom - top) * (right - left)) as f32;
-            let [mean, square] = [0, 1].map(|k| {
-                let at = |y: usize, x: usize| sums[y * SIDE + x][k];
-                (at(bottom, right) - at(top, right) - at(bottom, left) + at(top, left)) / n
-            });
-            let variance = (square - mean * mean).max(0.0);
-            (luma[y * CLIP_PX + x] - mean) / (variance + CONTRAST_FLOOR * CONTRAST_FLOOR).sqrt()
-        })
-        .collect()
-}
 
 /// What the ensemble says about one candidate, in the pixels of the picture that it saw.
 #[derive(Clone, Debug, PartialEq)]
@@ -433,73 +304,10 @@ mod tests {
     }
 
     #[test]
-    fn a_mirrored_clip_shows_the_same_place() {
-        let picture = RgbImage::from_fn(120, 100, |x, y| image::Rgb([x as u8, y as u8, 0]));
-        let center = Pixel::new(61.4, 47.8);
-        for sign in [[1, 1], [-1, 1], [1, -1], [-1, -1]] {
-            let clip = Clip::mirrored(&picture, center, sign);
-            let at = clip.to_clip(center);
-            assert!((at[0] - 32.0).hypot(at[1] - 32.0) < 0.75);
-            assert!(clip.to_picture(Pixel::new(at[0], at[1])).distance_px(&center) < 1e-9);
-            for (x, y) in [(3, 5), (32, 32), (60, 11)] {
-                let there = clip.to_picture(Pixel::new(f64::from(x), f64::from(y)));
-                let at = 3 * (y as usize * CLIP_PX + x as usize);
-                assert_eq!([clip.rgb[at], clip.rgb[at + 1]], [there.u_px as u8, there.v_px as u8]);
-            }
-        }
-    }
-
-    #[test]
     fn nothing_there_is_background() {
         let mut nothing = vec![0f32; MAP_CELLS * MAP_CELLS * FINE_CHANNELS];
         nothing.chunks_exact_mut(FINE_CHANNELS).for_each(|cell| cell[0] = 1.0);
         let evidence = judge(&[&nothing], [32.0, 32.0]);
         assert!(evidence.of(Class::Background) > 0.99 && evidence.fastener() < 0.01);
-    }
-
-    #[test]
-    fn gamma_evens_out_dark_and_bright_clips() {
-        let at = Pixel::new(40.0, 40.0);
-        for (value, expected) in [(30u8, 0.4), (115, 1.0), (190, 2.5)] {
-            let picture = RgbImage::from_pixel(80, 80, image::Rgb([value; 3]));
-            let gamma = Clip::cut(&picture, at).gamma();
-            assert!((gamma - expected).abs() < 0.05, "{value}: {gamma}");
-        }
-        let mut input = vec![0f32; CLIP_PX * CLIP_PX * FINE_INPUT_CHANNELS];
-        Clip::cut(&RgbImage::from_pixel(80, 80, image::Rgb([60; 3])), at).network_input(&mut input);
-        for pixel in input.chunks_exact(FINE_INPUT_CHANNELS) {
-            assert!(
-                pixel[..3].iter().all(|v| (v - (2.0 * 0.45 - 1.0)).abs() < 0.05) && pixel[3].abs() < 1e-3,
-                "{pixel:?}"
-            );
-        }
-    }
-
-    #[test]
-    fn the_recess_of_a_black_head_is_seen_as_that_of_a_bright_one() {
-        // a bright panel, a head with a ring as recess, four levels or forty darker than the head
-        let contrast = |head: u8, recess: u8| {
-            let picture = RgbImage::from_fn(80, 80, |x, y| {
-                let r = (f64::from(x) - 40.0).hypot(f64::from(y) - 40.0);
-                image::Rgb(
-                    [if r > 24.0 {
-                        210
-                    } else if (4.0..7.0).contains(&r) {
-                        recess
-                    } else {
-                        head
-                    }; 3],
-                )
-            });
-            let mut input = vec![0f32; CLIP_PX * CLIP_PX * FINE_INPUT_CHANNELS];
-            Clip::cut(&picture, Pixel::new(40.0, 40.0)).network_input(&mut input);
-            let at = |x: usize| input[(CLIP_CENTER_PX * CLIP_PX + x) * FINE_INPUT_CHANNELS + 3];
-            at(CLIP_CENTER_PX) - at(CLIP_CENTER_PX + 5)
-        };
-        let (bright, black, none) = (contrast(160, 120), contrast(20, 14), contrast(20, 20));
-        assert!(
-            bright > 1.5 && black > 0.4 * bright && none.abs() < 0.01,
-            "{bright} {black} {none}"
-        );
     }
 }

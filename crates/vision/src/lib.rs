@@ -27,6 +27,7 @@
 //! ```
 
 mod center;
+mod clip;
 mod coarse;
 mod components;
 mod detect;
@@ -42,9 +43,10 @@ mod report;
 mod synthetic;
 
 pub use center::{Circle, Cross, Cue, CueCenter, Fused, cross, fuse, outer_circle};
+pub use clip::Clip;
 pub use coarse::{Candidate, ProbabilityMap, candidates, coarse_map};
 pub use detect::{Detections, Detector, Drive, Options, Region, Screw, Timing, Verdict};
-pub use fine::{Clip, Evidence, look};
+pub use fine::{Evidence, look};
 pub use locate::{DepthSource, Located, locate};
 pub use marker::{LocatedMarker, Marker, MarkerError, MarkerSpec, find_marker, locate_marker};
 pub use model::{Corrections, Model, ModelError, Settings, Thresholds, decode_model, encode_model, model_id};
