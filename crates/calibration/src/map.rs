@@ -10,7 +10,6 @@ use crate::{
 use geometry::{Base, Camera, CameraModel, Point, Transform};
 use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
-use sha2::{Digest, Sha256};
 use std::path::{Path, PathBuf};
 
 /// How a map is fitted.
@@ -62,7 +61,7 @@ pub struct Identity {
 /// A name for a camera that changes whenever its intrinsics do, since pairs and queries must share them.
 pub fn camera_identity(model: &CameraModel) -> String {
     let text = format!("{model:?}");
-    format!("sha256:{}", &hex(&Sha256::digest(text.as_bytes()))[..16])
+    format!("sha256:{}", &geometry::sha256_hex(text.as_bytes())[..16])
 }
 
 /// What the user chooses about a fit, and what the file should remember.
@@ -310,7 +309,7 @@ impl Map {
             format: FORMAT.into(),
             version: VERSION,
             made_by: concat!("unscrew ", env!("CARGO_PKG_VERSION")).into(),
-            pairs_sha256: format!("sha256:{}", hex(&Sha256::digest(pair::to_csv(pairs).as_bytes()))),
+            pairs_sha256: format!("sha256:{}", geometry::sha256_hex(pair::to_csv(pairs).as_bytes())),
             settings: settings.clone(),
             held_out: report.held_out,
             rejected: report.rejected.len(),
@@ -582,6 +581,3 @@ fn scales(model: &Model, camera: &[Vector3<f64>], command: &[Vector3<f64>], held
     scales
 }
 
-fn hex(bytes: &[u8]) -> String {
-    bytes.iter().map(|b| format!("{b:02x}")).collect()
-}

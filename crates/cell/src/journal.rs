@@ -6,9 +6,7 @@
 use crate::record::{Event, PictureId, UnitRecord};
 use geometry::RgbImage;
 use rusqlite::{Connection, ErrorCode, OpenFlags, OptionalExtension, params};
-use sha2::{Digest, Sha256};
 use std::{
-    fmt::Write as _,
     fs,
     io::Cursor,
     path::{Path, PathBuf},
@@ -234,15 +232,7 @@ impl Journal {
             .encode_image(picture)
             .map_err(|e| bad(&self.folder, e.to_string()))?;
         let bytes = bytes.into_inner();
-        let id = PictureId(
-            Sha256::digest(&bytes)
-                .iter()
-                .fold(String::with_capacity(64), |mut hex, byte| {
-                    // writing to a string cannot fail
-                    let _ = write!(hex, "{byte:02x}");
-                    hex
-                }),
-        );
+        let id = PictureId(geometry::sha256_hex(&bytes));
         let path = self.picture_path(&id);
         if !path.exists() {
             geometry::write_aside(&path, &bytes).map_err(|e| bad(&path, e.to_string()))?;
@@ -430,8 +420,7 @@ mod tests {
         let (a, b) = (journal.store_picture(&grey, 88)?, journal.store_picture(&grey, 88)?);
         assert_eq!(a, b);
         let bytes = fs::read(journal.picture_path(&a)).expect("picture");
-        let hash: String = Sha256::digest(&bytes).iter().map(|b| format!("{b:02x}")).collect();
-        assert_eq!(hash, a.0);
+        assert_eq!(geometry::sha256_hex(&bytes), a.0);
         assert_eq!(
             fs::read_dir(dir.path().join(PICTURE_FOLDER)).expect("folder").count(),
             1

@@ -14,15 +14,14 @@ use std::path::Path;
 use std::sync::Arc;
 
 fn runner(fake: &Fake, folder: &Path) -> Runner {
-    runner_with(fake, folder, Program::paper().expect("built-in program"))
+    runner_with(fake, folder, Program::paper().expect("built-in program"), fake.clone())
 }
 
-fn runner_with(fake: &Fake, folder: &Path, program: Program) -> Runner {
+fn runner_with(fake: &Fake, folder: &Path, program: Program, finder: impl cell::run::Finder + 'static) -> Runner {
     let journal = Journal::open(folder).expect("journal");
-    let finder = Arc::new(fake.clone());
     Runner::new(
         fake.devices(),
-        finder,
+        Arc::new(finder),
         vec![map()],
         program,
         CellConfig::simulated(),
@@ -144,7 +143,7 @@ fn a_bent_face_excludes_and_a_survey_sees_it_before_the_first_screw() {
     };
     for (program, drives) in [(survey, 0), (Program::paper().expect("built-in program"), 4)] {
         let (fake, folder) = (bent(), tempfile::tempdir().expect("folder"));
-        let record = block_on(runner_with(&fake, folder.path(), program).run_unit(&Silent)).expect("a record");
+        let record = block_on(runner_with(&fake, folder.path(), program, fake.clone()).run_unit(&Silent)).expect("a record");
         let Some(Outcome::Excluded {
             reason,
             screws_out_before,
@@ -349,15 +348,8 @@ fn a_stuck_cover_settles_the_doubt_about_a_head() {
         ("top", vec![screw(0.0, 0.0), screw(90.0, 0.0)]),
     ]);
     let folder = tempfile::tempdir().expect("folder");
-    let mut runner = Runner::new(
-        fake.devices(),
-        Arc::new(Doubtful(fake.clone())),
-        vec![map()],
-        Program::paper().expect("built-in program"),
-        CellConfig::simulated(),
-        Journal::open(folder.path()).expect("journal"),
-    )
-    .expect("runner");
+    let program = Program::paper().expect("built-in program");
+    let mut runner = runner_with(&fake, folder.path(), program, Doubtful(fake.clone()));
     let record = block_on(runner.run_unit(&Silent)).expect("a record");
     assert_eq!(record.outcome, Some(Outcome::Ok));
     assert_eq!(
@@ -387,15 +379,8 @@ fn a_screw_that_is_seen_but_not_met_is_searched_for_around_its_place() {
     }
     let fake = Fake::new(&[("front", vec![screw(10.0, 20.0)])]);
     let folder = tempfile::tempdir().expect("folder");
-    let mut runner = Runner::new(
-        fake.devices(),
-        Arc::new(Off(fake.clone())),
-        vec![map()],
-        Program::paper().expect("built-in program"),
-        CellConfig::simulated(),
-        Journal::open(folder.path()).expect("journal"),
-    )
-    .expect("runner");
+    let program = Program::paper().expect("built-in program");
+    let mut runner = runner_with(&fake, folder.path(), program, Off(fake.clone()));
     let record = block_on(runner.run_unit(&Silent)).expect("a record");
     assert_eq!(record.outcome, Some(Outcome::Ok));
     assert_eq!((fake.standing(), record.screws_out()), (0, 1));

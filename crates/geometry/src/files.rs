@@ -3,6 +3,7 @@
 use crate::{CameraModel, DepthMap, RgbdFrame};
 use image::{DynamicImage, ImageDecoder, ImageReader, RgbImage, codecs::jpeg::JpegEncoder};
 use serde::Deserialize;
+use sha2::{Digest, Sha256};
 use std::{
     fs,
     io::{BufReader, Write},
@@ -299,6 +300,11 @@ pub fn write_camera_info(path: &Path, name: &str, c: &CameraModel) -> Result<(),
     write_aside(path, text.as_bytes())
 }
 
+/// The name of bytes by what they are: their SHA-256 in 64 hexadecimal digits.
+pub fn sha256_hex(bytes: &[u8]) -> String {
+    Sha256::digest(bytes).iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
 /// Writes bytes beside the target, then renames: a reader sees the old file or the whole new one, never a part.
 ///
 /// # Errors
@@ -472,6 +478,12 @@ mod tests {
         let cut = dir.path().join("cut.png");
         fs::write(&cut, &bytes[..bytes.len() / 2]).expect("written");
         assert!(matches!(read_color(&cut), Err(FileError::Picture { .. })));
+    }
+
+    #[test]
+    fn bytes_have_the_name_that_sha256sum_gives_them() {
+        let abc = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"; // FIPS 180-2, appendix B.1
+        assert_eq!(sha256_hex(b"abc"), abc);
     }
 
     #[test]

@@ -25,7 +25,7 @@ mod rgbd;
 pub use camera::CameraModel;
 pub use depth::{DepthMap, SurfaceSample};
 pub use files::{
-    FileError, read_camera_info, read_color, read_depth, read_rgbd, write_aside, write_camera_info, write_depth_png,
+    FileError, read_camera_info, read_color, read_depth, read_rgbd, sha256_hex, write_aside, write_camera_info, write_depth_png,
     write_jpeg, write_png,
 };
 pub use frame::{Base, Camera, Direction, Face, Flange, Frame, Pixel, Point, Table, Tool, Transform, Unit, space};

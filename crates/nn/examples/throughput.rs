@@ -10,17 +10,6 @@ use std::time::Instant;
 use nn::{LayerSpec, RowSource, Spec, Tensor, Trainer};
 use rayon::prelude::*;
 
-fn conv(kernel: usize, stride: usize, dilation: usize, out: usize) -> LayerSpec {
-    LayerSpec::Conv {
-        kernel,
-        stride,
-        dilation,
-        out,
-        batch_norm: true,
-        relu: true,
-    }
-}
-
 /// A picture that costs nothing to read.
 struct Grey(usize, usize, usize);
 
@@ -106,7 +95,7 @@ fn main() {
     println!("{threads} threads, {peak:.0} GFLOP/s of multiplications and additions");
 
     let training_only = std::env::args().any(|argument| argument == "training");
-    let layers = |channels: usize, count: usize| vec![conv(3, 1, 1, channels); count];
+    let layers = |channels: usize, count: usize| vec![LayerSpec::conv(3, 1, 1, channels); count];
     let mut cases: Vec<(String, Spec, usize, usize)> = [16, 24, 32, 48, 64]
         .into_iter()
         .map(|c| {
@@ -117,16 +106,9 @@ fn main() {
             (format!("4 x 3x3, {c} channels"), spec, 1503 / 2, 2052 / 2)
         })
         .collect();
-    let mut detector = vec![conv(3, 2, 1, 16), conv(3, 2, 1, 32)];
-    detector.extend([1, 1, 2, 1].map(|dilation| conv(3, 1, dilation, 32)));
-    detector.push(LayerSpec::Conv {
-        kernel: 1,
-        stride: 1,
-        dilation: 1,
-        out: 11,
-        batch_norm: false,
-        relu: false,
-    });
+    let mut detector = vec![LayerSpec::conv(3, 2, 1, 16), LayerSpec::conv(3, 2, 1, 32)];
+    detector.extend([1, 1, 2, 1].map(|dilation| LayerSpec::conv(3, 1, dilation, 32)));
+    detector.push(LayerSpec::output(11));
     let detector = Spec {
         input_channels: 3,
         layers: detector,

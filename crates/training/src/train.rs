@@ -9,7 +9,6 @@ use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use serde::Serialize;
 use serde_json::json;
-use sha2::{Digest, Sha256};
 use std::{
     collections::BTreeMap,
     ops::Range,
@@ -363,7 +362,7 @@ impl Lesson<'_> {
         };
         let kept = settings.work.as_ref().map(|folder| {
             let key = json!([RECIPE, settings_key(settings), trainer.spec(), name]).to_string();
-            folder.join(format!("{name}-{}.checkpoint", &hex(&Sha256::digest(key))[..12]))
+            folder.join(format!("{name}-{}.checkpoint", &geometry::sha256_hex(key.as_bytes())[..12]))
         });
         let mut mean_loss = f32::NAN;
         if let Some(path) = kept.as_ref().filter(|p| p.exists()) {
@@ -420,10 +419,6 @@ fn settings_key(settings: &TrainSettings) -> serde_json::Value {
         tuning_faces: 0,
         ..settings.clone()
     })
-}
-
-fn hex(bytes: &[u8]) -> String {
-    bytes.iter().map(|b| format!("{b:02x}")).collect()
 }
 
 /// A number that depends on all of `parts` (FNV-1a).
