@@ -7,8 +7,8 @@ use scene::Unit;
 use serde::{Deserialize, Serialize};
 use vision::layout::Class;
 use vision::{
-    Corrections, Detector, Evidence, Model, Options, Screw, Settings, Thresholds, Verdict, candidates, coarse_map,
-    cross, locate, look, outer_circle,
+    Corrections, CueCenter, Detector, Evidence, Model, Options, Screw, Settings, Thresholds, Verdict, candidates,
+    coarse_map, cross, locate, look, normal_at, outer_circle, parallax_px,
 };
 
 /// Share of a normal distribution within one sigma.
@@ -17,6 +17,8 @@ const ONE_SIGMA: f64 = 0.6827;
 const ENOUGH: usize = 20;
 /// Faces that the cues' factors are measured on; more need not be held in memory at once.
 const CUE_FACES: usize = 40;
+/// A cue farther off than this has met something else, in head diameters.
+const GROSS: f64 = 0.15;
 /// Cost of a screw that is not found, in units of one miss.
 const MISS: f64 = 1.0;
 /// Cost of something taken for a screw: a burst on what is none, and a mark on the part. A missed screw costs the unit.
@@ -162,9 +164,20 @@ fn median(mut values: Vec<f64>) -> f64 {
     values.get(values.len() / 2).copied().unwrap_or(0.0)
 }
 
+/// A cue's centre on one screw.
+struct CueError {
+    /// Off the truth, px.
+    off_px: [f64; 2],
+    /// Where something one head diameter below the rim appears, from the rim, px.
+    parallax_px: [f64; 2],
+    diameter_px: f64,
+    /// What the cue says of itself, px.
+    sigma_px: f64,
+}
+
 /// Each cue alone against truth, from where a detection starts it.
 fn cue_factors(model: &Model, shots: &[Shot], corrections: &mut Corrections) {
-    let (mut circles, mut crosses, mut learned) = (Vec::new(), Vec::new(), Vec::new());
+    let mut cues: [Vec<CueError>; 3] = Default::default();
     for shot in shots {
         let picture = &shot.frame.color;
         let places: Vec<_> = candidates(&coarse_map(&model.coarse, picture), &model.settings.thresholds)
@@ -180,21 +193,55 @@ fn cue_factors(model: &Model, shots: &[Shot], corrections: &mut Corrections) {
             let Some(find) = finds.max_by(|a, b| a.of(Class::Cross).total_cmp(&b.of(Class::Cross))) else {
                 continue;
             };
-            learned.extend(errors(at(find), truth.pixel).map(|e| e / find.sigma_px));
-            if let Some(c) = outer_circle(picture, at(find), find.diameter_px) {
-                circles.extend(errors(c.center.pixel, truth.pixel).map(|e| e / c.diameter_px));
-            }
-            if let Some(c) = cross(picture, at(find), find.diameter_px) {
-                crosses.extend(errors(c.center.pixel, truth.pixel).map(|e| e / c.center.sigma_px));
+            let (at, diameter_px) = (at(find), find.diameter_px);
+            let space = shot.frame.depth.as_ref().zip(shot.frame.camera.as_ref());
+            let parallax = space.and_then(|(depth, camera)| {
+                let normal = normal_at(depth, camera, at, diameter_px)?;
+                Some(parallax_px(camera, at, normal, diameter_px))
+            });
+            let learned = CueCenter {
+                pixel: at,
+                sigma_px: find.sigma_px,
+            };
+            let circle = outer_circle(picture, at, diameter_px).map(|c| c.center);
+            let crossed = cross(picture, at, diameter_px).map(|c| c.center);
+            for (errors, cue) in cues.iter_mut().zip([Some(learned), circle, crossed]) {
+                errors.extend(cue.map(|cue| CueError {
+                    off_px: [cue.pixel.u_px - truth.pixel.u_px, cue.pixel.v_px - truth.pixel.v_px],
+                    parallax_px: parallax.unwrap_or_default(),
+                    diameter_px,
+                    sigma_px: cue.sigma_px,
+                }));
             }
         }
     }
+    corrections.below_rim = cues.each_ref().map(|errors| below_rim(errors));
+    let rest = |cue: usize, unit: &dyn Fn(&CueError) -> f64| -> Vec<f64> {
+        let below = corrections.below_rim[cue];
+        let of = |e: &CueError| [0, 1].map(|k| (e.off_px[k] - below * e.parallax_px[k]).abs() / unit(e));
+        cues[cue].iter().flat_map(of).collect()
+    };
+    let circles = rest(1, &|e| e.diameter_px);
     if circles.len() >= ENOUGH {
         // how well the outline is seen says little about where the recess is: eccentricity is what there is to measure
         corrections.eccentricity = quantile(circles, ONE_SIGMA);
     }
-    corrections.cross_sigma = one_sigma(crosses);
-    corrections.learned_sigma = one_sigma(learned);
+    (corrections.learned_sigma, corrections.cross_sigma) =
+        (one_sigma(rest(0, &|e| e.sigma_px)), one_sigma(rest(2, &|e| e.sigma_px)));
+}
+
+/// How far below the rim a cue rests, in head diameters: least squares over all but the gross errors.
+fn below_rim(errors: &[CueError]) -> f64 {
+    let fair = errors
+        .iter()
+        .filter(|e| e.off_px[0].hypot(e.off_px[1]) < GROSS * e.diameter_px);
+    let sum = |of: &dyn Fn(&CueError) -> f64| fair.clone().map(of).sum::<f64>();
+    let dot = |a: [f64; 2], b: [f64; 2]| a[0] * b[0] + a[1] * b[1];
+    let square = sum(&|e| dot(e.parallax_px, e.parallax_px));
+    if errors.len() < ENOUGH || square < 1e-9 {
+        return 0.0;
+    }
+    sum(&|e| dot(e.off_px, e.parallax_px)) / square
 }
 
 /// [`Corrections::score`] by which the scores are likeliest, with targets that guard against overconfidence (Platt 1999).

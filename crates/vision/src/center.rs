@@ -440,8 +440,8 @@ pub fn cross(picture: &RgbImage, start: Pixel, diameter_px: f64) -> Option<Cross
     })
 }
 
-/// Below this the recess is buried, worn off, or no cross.
-const MIN_SYMMETRY: f64 = 0.12;
+/// Below this the recess is buried, worn off, or no cross: what is found is rust as often as not.
+const MIN_SYMMETRY: f64 = 0.25;
 
 struct Peak {
     dx: f64,
@@ -480,26 +480,33 @@ fn paraboloid(value: impl Fn(f64, f64) -> f64, h: f64) -> Option<Peak> {
 
 /// Fuses the cues by inverse variance; one that contradicts the others is left out.
 ///
+/// # Arguments
+/// * `parallax_px` – where something one head diameter below the rim appears, seen from the rim ([`parallax_px`](crate::parallax_px));
+///   zero where that is not known.
+///
 /// # Returns
 /// `None` without any cue. Where two cues contradict each other and no third decides, the surer one stays, with a sigma that says so.
 pub fn fuse(
     learned: Option<CueCenter>,
     circle: Option<Circle>,
     cross: Option<Cross>,
+    parallax_px: [f64; 2],
     corrections: &Corrections,
 ) -> Option<Fused> {
     let mut held: Vec<(Cue, CueCenter)> = Vec::with_capacity(3);
-    let scaled = |c: CueCenter, factor: f64| CueCenter {
+    let [du, dv] = parallax_px;
+    let corrected = |c: CueCenter, factor: f64, below: f64| CueCenter {
         sigma_px: c.sigma_px * factor,
-        ..c
+        pixel: Pixel::new(c.pixel.u_px - below * du, c.pixel.v_px - below * dv),
     };
-    held.extend(learned.map(|c| (Cue::Learned, scaled(c, corrections.learned_sigma))));
+    let [learned_below, circle_below, cross_below] = corrections.below_rim;
+    held.extend(learned.map(|c| (Cue::Learned, corrected(c, corrections.learned_sigma, learned_below))));
     held.extend(circle.map(|c| {
-        let mut center = scaled(c.center, corrections.circle_sigma);
+        let mut center = corrected(c.center, corrections.circle_sigma, circle_below);
         center.sigma_px = center.sigma_px.hypot(corrections.eccentricity * c.diameter_px);
         (Cue::Circle, center)
     }));
-    held.extend(cross.map(|c| (Cue::Cross, scaled(c.center, corrections.cross_sigma))));
+    held.extend(cross.map(|c| (Cue::Cross, corrected(c.center, corrections.cross_sigma, cross_below))));
     let mut dispute = 0f64;
     while held.len() > 1 {
         let all = mean(&held)?;
@@ -662,6 +669,7 @@ mod tests {
             Some(at(0.1, 0.4)),
             Some(circle(0.8, 0.05)),
             Some(cross(0.0, 0.1)),
+            [0.0; 2],
             &corrections,
         )
         .expect("cues");
@@ -671,13 +679,24 @@ mod tests {
             Some(at(0.1, 0.4)),
             Some(circle(6.0, 0.05)),
             Some(cross(0.0, 0.1)),
+            [0.0; 2],
             &corrections,
         )
         .expect("cues");
         assert_eq!(gated.cues, [Cue::Learned, Cue::Cross]);
-        let dispute = fuse(Some(at(8.0, 0.4)), None, Some(cross(0.0, 0.1)), &corrections).expect("cues");
+        let dispute = fuse(Some(at(8.0, 0.4)), None, Some(cross(0.0, 0.1)), [0.0; 2], &corrections).expect("cues");
         assert_eq!(dispute.cues, [Cue::Cross]);
         assert!(dispute.center.sigma_px > 1.5, "{dispute:?}");
-        assert!(fuse(None, None, None, &corrections).is_none());
+        // the outline lies deeper: seen from aside, it is off, and the fusion knows by how much
+        let deep = Corrections {
+            below_rim: [0.0, 0.2, 0.0],
+            ..Corrections::default()
+        };
+        let aside = fuse(Some(at(0.0, 0.4)), Some(circle(2.0, 0.05)), None, [10.0, 0.0], &deep).expect("cues");
+        assert!(
+            aside.cues.len() == 2 && aside.center.pixel.u_px.abs() < 1e-9,
+            "{aside:?}"
+        );
+        assert!(fuse(None, None, None, [0.0; 2], &corrections).is_none());
     }
 }

@@ -5,7 +5,7 @@ use std::ops::RangeInclusive;
 use std::path::Path;
 use std::time::Instant;
 
-use geometry::{Camera, Direction, Pixel, Point, RgbdFrame};
+use geometry::{Camera, CameraModel, DepthMap, Direction, Pixel, Point, RgbdFrame};
 use image::RgbImage;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -14,7 +14,7 @@ use crate::center::{Cue, CueCenter, cross, fuse, outer_circle};
 use crate::coarse::{candidates, coarse_map, suppress};
 use crate::fine::{Evidence, look};
 use crate::layout::{CLIP_PX, Class, STRIDE};
-use crate::locate::locate;
+use crate::locate::{locate, normal_at, parallax_px};
 use crate::picture::{Level, pyramid_scales};
 use crate::{Model, ModelError};
 
@@ -286,31 +286,17 @@ impl Detector {
             width_px,
             height_px,
         };
-        self.run(picture, whole, options, |_| {})
+        self.run(picture, whole, options, None)
     }
 
     /// Finds the screws whose centres lie in a part of a shot, for a second look; costs only its share.
     pub fn detect_in(&self, frame: &RgbdFrame, region: Region, options: &Options) -> Detections {
-        self.run(&frame.color, region, options, |screws| {
-            let (Some(depth), Some(camera)) = (&frame.depth, &frame.camera) else {
-                return;
-            };
-            screws.par_iter_mut().for_each(|screw| {
-                let corrections = &self.model.settings.corrections;
-                let found = locate(
-                    depth,
-                    camera,
-                    screw.pixel,
-                    screw.sigma_px,
-                    screw.diameter_px,
-                    corrections,
-                );
-                screw.camera = found.map(|f| f.point);
-                screw.normal = found.map(|f| f.normal);
-                screw.sigma_lateral_mm = found.map(|f| f.sigma_lateral_mm);
-                screw.sigma_depth_mm = found.map(|f| f.sigma_depth_mm);
-            });
-        })
+        self.run(
+            &frame.color,
+            region,
+            options,
+            frame.depth.as_ref().zip(frame.camera.as_ref()),
+        )
     }
 
     fn run(
@@ -318,7 +304,7 @@ impl Detector {
         picture: &RgbImage,
         region: Region,
         options: &Options,
-        locate: impl FnOnce(&mut [Screw]),
+        space: Option<(&DepthMap, &CameraModel)>,
     ) -> Detections {
         let begin = Instant::now();
         let mut timing_ms = Timing::default();
@@ -334,7 +320,7 @@ impl Detector {
         let start = Instant::now();
         let mut screws: Vec<Screw> = finds
             .par_iter()
-            .filter_map(|find| self.decide(picture, find, options))
+            .filter_map(|find| self.decide(picture, find, options, space))
             .collect();
         let rank = |s: &Screw| match s.verdict {
             Verdict::Screw => 0,
@@ -344,7 +330,9 @@ impl Detector {
         screws.sort_by(|a, b| rank(a).cmp(&rank(b)).then(b.score.total_cmp(&a.score)));
         timing_ms.centre = ms_since(start);
         let start = Instant::now();
-        locate(&mut screws);
+        if let Some((depth, camera)) = space {
+            screws.par_iter_mut().for_each(|screw| self.place(screw, depth, camera));
+        }
         timing_ms.locate = ms_since(start);
         timing_ms.total = ms_since(begin);
         Detections {
@@ -403,7 +391,13 @@ impl Detector {
     }
 
     /// Verdict, drive and centre of a find; `None` where it is nothing.
-    fn decide(&self, picture: &RgbImage, find: &Find, options: &Options) -> Option<Screw> {
+    fn decide(
+        &self,
+        picture: &RgbImage,
+        find: &Find,
+        options: &Options,
+        space: Option<(&DepthMap, &CameraModel)>,
+    ) -> Option<Screw> {
         let settings = &self.model.settings;
         let probability = |drive: Drive| drive.class().map_or(0.0, |c| f64::from(find.evidence.of(c)));
         let calibrated = |p: f64| settings.corrections.probability(p);
@@ -438,7 +432,12 @@ impl Detector {
         let crossed = (drive == Drive::Cross || drive == Drive::Unknown)
             .then(|| cross(picture, find.pixel, find.diameter_px))
             .flatten();
-        let fused = fuse(Some(learned), circle, crossed, &settings.corrections)?;
+        let parallax = space.and_then(|(depth, camera)| {
+            let normal = normal_at(depth, camera, find.pixel, find.diameter_px)?;
+            Some(parallax_px(camera, find.pixel, normal, find.diameter_px))
+        });
+        let parallax = parallax.unwrap_or_default();
+        let fused = fuse(Some(learned), circle, crossed, parallax, &settings.corrections)?;
         let used = |cue| fused.cues.contains(&cue);
         Some(Screw {
             pixel: fused.center.pixel,
@@ -457,6 +456,23 @@ impl Detector {
             sigma_lateral_mm: None,
             sigma_depth_mm: None,
         })
+    }
+
+    /// Puts a find into space.
+    fn place(&self, screw: &mut Screw, depth: &DepthMap, camera: &CameraModel) {
+        let corrections = &self.model.settings.corrections;
+        let found = locate(
+            depth,
+            camera,
+            screw.pixel,
+            screw.sigma_px,
+            screw.diameter_px,
+            corrections,
+        );
+        screw.camera = found.map(|f| f.point);
+        screw.normal = found.map(|f| f.normal);
+        screw.sigma_lateral_mm = found.map(|f| f.sigma_lateral_mm);
+        screw.sigma_depth_mm = found.map(|f| f.sigma_depth_mm);
     }
 }
 
@@ -524,7 +540,7 @@ mod tests {
                 ..Options::default()
             };
             detector
-                .decide(&picture, &find(50.0, 30.0, cross, slotted), &options)
+                .decide(&picture, &find(50.0, 30.0, cross, slotted), &options, None)
                 .map(|s| (s.verdict, s.drive))
         };
         assert_eq!(verdict(0.95, 0.0, Drive::Cross), Some((Verdict::Screw, Drive::Cross)));

@@ -17,6 +17,7 @@ const RIM_HEIGHT: [f64; 2] = [0.27, 0.09];
 const STEEPEST: f64 = 1.0;
 /// Stereo errors of neighbouring measurements go together: so many count as one.
 const MEASUREMENTS_A_SAMPLE: f64 = 4.0;
+
 /// What a depth rests on; the value is its place in [`Corrections::depth_rise`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum DepthSource {
@@ -57,29 +58,22 @@ pub fn locate(
     diameter_px: f64,
     corrections: &Corrections,
 ) -> Option<Located> {
-    let ring = |[inner, outer]: [f64; 2]| {
-        depth
-            .plane_at(pixel, inner * diameter_px, outer * diameter_px)
-            .filter(|plane| believable(plane, camera, pixel))
-    };
+    let ring = |ring| plane(depth, camera, pixel, diameter_px, ring);
     let noise = |plane: &SurfaceSample| plane.sigma_mm * MEASUREMENTS_A_SAMPLE.sqrt();
+    let normal = normal_at(depth, camera, pixel, diameter_px)?;
     // Depth of the rim from that of a ring's plane: (rise, spread) in head diameters, along the normal.
     let rim = |plane: SurfaceSample, [rise, spread]: [f64; 2], source| {
         let head_mm = diameter_px * camera.pixel_mm(plane.depth_mm);
-        let normal = normal(&plane, camera, pixel)?;
         let depth_mm = plane.depth_mm - rise * head_mm * normal.vector().z.abs();
-        Some((plane, depth_mm, spread * head_mm, normal, source))
+        (plane, depth_mm, spread * head_mm, source)
     };
     let more = |[rise, spread]: [f64; 2], source| [rise + corrections.depth_rise[source as usize], spread];
-    let top = || rim(ring(TOP_RING)?, more(DOME, DepthSource::Head), DepthSource::Head);
+    let top = ring(TOP_RING).map(|top| rim(top, more(DOME, DepthSource::Head), DepthSource::Head));
     let sheet = || {
-        rim(
-            ring(SHEET_RING)?,
-            more(RIM_HEIGHT, DepthSource::Sheet),
-            DepthSource::Sheet,
-        )
+        let rise = more(RIM_HEIGHT, DepthSource::Sheet);
+        ring(SHEET_RING).map(|sheet| rim(sheet, rise, DepthSource::Sheet))
     };
-    let (plane, depth_mm, spread_mm, normal, source) = top().or_else(sheet)?;
+    let (plane, depth_mm, spread_mm, source) = top.or_else(sheet)?;
     Some(Located {
         point: camera.unproject(pixel, depth_mm),
         sigma_depth_mm: noise(&plane).hypot(spread_mm) * corrections.depth_sigma,
@@ -87,6 +81,36 @@ pub fn locate(
         normal,
         source,
     })
+}
+
+/// Normal of the surface around a head, towards the camera: of the sheet, whose plane is far wider than the head's top, and of that
+/// only where the sheet has no depth.
+///
+/// # Returns
+/// `None` where neither has depth.
+pub fn normal_at(depth: &DepthMap, camera: &CameraModel, pixel: Pixel, diameter_px: f64) -> Option<Direction<Camera>> {
+    let of = |ring| normal(&plane(depth, camera, pixel, diameter_px, ring)?, camera, pixel);
+    of(SHEET_RING).or_else(|| of(TOP_RING))
+}
+
+/// Where something that lies one head diameter below the recess rim appears, seen from the rim: a pixel's offset, px.
+pub fn parallax_px(camera: &CameraModel, pixel: Pixel, normal: Direction<Camera>, diameter_px: f64) -> [f64; 2] {
+    let (ray, n) = (camera.unproject(pixel, 1.0), normal.vector());
+    [ray.x_mm() * n.z - n.x, ray.y_mm() * n.z - n.y].map(|shift| shift * diameter_px)
+}
+
+/// The plane of a ring around a pixel, its radii in head diameters.
+fn plane(
+    depth: &DepthMap,
+    camera: &CameraModel,
+    pixel: Pixel,
+    diameter_px: f64,
+    ring: [f64; 2],
+) -> Option<SurfaceSample> {
+    let [inner, outer] = ring.map(|r| r * diameter_px);
+    depth
+        .plane_at(pixel, inner, outer)
+        .filter(|plane| believable(plane, camera, pixel))
 }
 
 fn believable(plane: &SurfaceSample, camera: &CameraModel, pixel: Pixel) -> bool {
@@ -161,6 +185,25 @@ mod tests {
         assert!((found.sigma_lateral_mm - 0.2 * RIM_MM / 4638.0).abs() < 0.01);
         // 0.03 mm a pixel of 0.32 mm is a tilt of 5 degrees.
         assert!((0.98..0.998).contains(&-found.normal.vector().z), "{found:?}");
+    }
+
+    #[test]
+    fn what_lies_below_the_rim_appears_where_the_camera_sees_it() {
+        let (map, camera) = scene(|_| true);
+        let normal = normal_at(&map, &camera, AT, DIAMETER_PX).expect("depth all over");
+        let rim = camera.unproject(AT, RIM_MM);
+        // one head diameter along the plane's normal into the sheet, seen by the same camera
+        let below = rim.vector() - normal.vector() * DIAMETER_PX * camera.pixel_mm(RIM_MM);
+        let seen = camera.project(Point::new(below.x, below.y, below.z)).expect("in view");
+        let [du, dv] = parallax_px(&camera, AT, normal, DIAMETER_PX);
+        let off = (seen.u_px - AT.u_px - du).hypot(seen.v_px - AT.v_px - dv);
+        assert!(
+            du.hypot(dv) > 2.0 && off < 0.05 * du.hypot(dv),
+            "{du} {dv}, off by {off}"
+        );
+        // 0.03 and -0.02 mm a pixel of 0.32 mm
+        let true_normal = Direction::new(0.094, -0.063, -1.0).expect("not zero");
+        assert!(normal.angle_rad(true_normal) < 0.02, "{normal:?}");
     }
 
     #[test]

@@ -8,7 +8,6 @@ use std::path::Path;
 
 use nn::{Network, NnError};
 use serde::{Deserialize, Serialize};
-use sha2::{Digest, Sha256};
 
 use crate::layout::{CLIP_PX, COARSE_CHANNELS, FINE_CHANNELS, FINE_INPUT_CHANNELS, STRIDE};
 
@@ -55,9 +54,12 @@ impl Default for Thresholds {
 pub struct Corrections {
     /// True error over stated sigma of the outer circle's centre.
     pub circle_sigma: f64,
-    /// How far a head's outline may be off its recess, standard deviation along each axis in head diameters: eccentric recesses,
-    /// washers, and the parallax between the rim and the outline below it. The circle is never surer than this.
+    /// How far a head's outline may be off its recess, standard deviation along each axis in head diameters: eccentric recesses and
+    /// washers. The circle is never surer than this.
     pub eccentricity: f64,
+    /// How far below the recess rim that lies which the learned centre, the circle and the cross rest on, in head diameters: seen
+    /// from aside they are off by the parallax. Taken out where depth says from which side.
+    pub below_rim: [f64; 3],
     /// True error over stated sigma of the cross's centre.
     pub cross_sigma: f64,
     /// True error over stated sigma of the learned centre.
@@ -89,6 +91,7 @@ impl Default for Corrections {
         Self {
             circle_sigma: 1.0,
             eccentricity: 0.04,
+            below_rim: [0.0; 3],
             cross_sigma: 1.0,
             learned_sigma: 1.0,
             fused_sigma: 1.0,
@@ -332,13 +335,7 @@ pub fn decode_model(bytes: &[u8], file: &str) -> Result<(BTreeMap<String, Vec<u8
 
 /// `sha256:` and the hash of a model file's bytes.
 pub fn model_id(bytes: &[u8]) -> String {
-    use std::fmt::Write;
-    Sha256::digest(bytes)
-        .iter()
-        .fold(String::from("sha256:"), |mut text, byte| {
-            let _ = write!(text, "{byte:02x}"); // writing to a string cannot fail
-            text
-        })
+    format!("sha256:{}", geometry::sha256_hex(bytes))
 }
 
 /// The header, and the networks' bytes, exactly as many as the header lists.
