@@ -580,4 +580,3 @@ fn scales(model: &Model, camera: &[Vector3<f64>], command: &[Vector3<f64>], held
     }
     scales
 }
-

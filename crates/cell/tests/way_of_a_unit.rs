@@ -143,7 +143,8 @@ fn a_bent_face_excludes_and_a_survey_sees_it_before_the_first_screw() {
     };
     for (program, drives) in [(survey, 0), (Program::paper().expect("built-in program"), 4)] {
         let (fake, folder) = (bent(), tempfile::tempdir().expect("folder"));
-        let record = block_on(runner_with(&fake, folder.path(), program, fake.clone()).run_unit(&Silent)).expect("a record");
+        let record =
+            block_on(runner_with(&fake, folder.path(), program, fake.clone()).run_unit(&Silent)).expect("a record");
         let Some(Outcome::Excluded {
             reason,
             screws_out_before,

@@ -25,8 +25,8 @@ mod rgbd;
 pub use camera::CameraModel;
 pub use depth::{DepthMap, SurfaceSample};
 pub use files::{
-    FileError, read_camera_info, read_color, read_depth, read_rgbd, sha256_hex, write_aside, write_camera_info, write_depth_png,
-    write_jpeg, write_png,
+    FileError, read_camera_info, read_color, read_depth, read_rgbd, sha256_hex, write_aside, write_camera_info,
+    write_depth_png, write_jpeg, write_png,
 };
 pub use frame::{Base, Camera, Direction, Face, Flange, Frame, Pixel, Point, Table, Tool, Transform, Unit, space};
 pub use rate::{Rate, wilson, wilson_share};

@@ -362,7 +362,10 @@ impl Lesson<'_> {
         };
         let kept = settings.work.as_ref().map(|folder| {
             let key = json!([RECIPE, settings_key(settings), trainer.spec(), name]).to_string();
-            folder.join(format!("{name}-{}.checkpoint", &geometry::sha256_hex(key.as_bytes())[..12]))
+            folder.join(format!(
+                "{name}-{}.checkpoint",
+                &geometry::sha256_hex(key.as_bytes())[..12]
+            ))
         });
         let mut mean_loss = f32::NAN;
         if let Some(path) = kept.as_ref().filter(|p| p.exists()) {

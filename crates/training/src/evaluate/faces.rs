@@ -5,7 +5,7 @@ use std::fmt::{self, Display, Formatter};
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
-use geometry::{Camera, CameraModel, Pixel, Point, Rate, RgbdFrame, read_color, read_depth};
+use geometry::{Camera, CameraModel, Direction, Pixel, Point, Rate, RgbdFrame, read_color, read_depth};
 use scene::fastener::Decoy;
 use scene::{FaceId, FaceTruth, Unit};
 use serde::{Deserialize, Serialize};
@@ -127,6 +127,8 @@ pub struct Evaluation {
     pub depth_bias_mm: Option<f64>,
     /// Error in space, mm.
     pub space_mm: Option<Quantiles>,
+    /// Angle between the normals of found screws and the screws' axes, degrees.
+    pub normal_deg: Option<Quantiles>,
     /// Found screws without a place in space.
     pub without_depth: usize,
     /// Errors of the centre, along u and v each, against `sigma_px`.
@@ -344,6 +346,7 @@ impl<'a> Evaluator<'a> {
             depth_mm: Quantiles::of(&spaces(|e| e.mm[2].abs())),
             depth_bias_mm: mean(&spaces(|e| e.mm[2])),
             space_mm: Quantiles::of(&spaces(|e| e.mm[0].hypot(e.mm[1]).hypot(e.mm[2]))),
+            normal_deg: Quantiles::of(&t.normal_deg),
             without_depth: t.without_depth,
             sigma: Coverage::of(&relative),
             depth_sigma: Coverage::of(&spaces(|e| e.mm[2] / e.sigma_depth_mm)),
@@ -381,6 +384,7 @@ struct Truth {
 struct TrueScrew {
     pixel: Pixel,
     point: Point<Camera>,
+    axis: Option<Direction<Camera>>,
     head_d_px: f64,
     detectable: bool,
     wear: Vec<String>,
@@ -413,6 +417,7 @@ impl Truth {
         let screws = truth.screws.iter().map(|s| TrueScrew {
             pixel: s.pixel,
             point: s.point,
+            axis: Some(s.axis),
             head_d_px: s.head_d_px,
             detectable: s.detectable,
             wear: s.wear.clone(),
@@ -487,6 +492,7 @@ struct Tally {
     candidates: usize,
     center: Vec<CenterError>,
     space: Vec<SpaceError>,
+    normal_deg: Vec<f64>,
     without_depth: usize,
     by_wear: BTreeMap<String, Share>,
     by_head: BTreeMap<String, Share>,
@@ -594,6 +600,8 @@ impl Tally {
             }),
             _ => self.without_depth += 1,
         }
+        let angle = |(normal, axis): (Direction<Camera>, _)| normal.angle_rad(axis).to_degrees();
+        self.normal_deg.extend(hit.normal.zip(screw.axis).map(angle));
     }
 
     /// Something that is no cross screw, and the find that speaks for it.
@@ -641,6 +649,7 @@ struct FileScrew {
     u: f64,
     v: f64,
     xyz_mm: [f64; 3],
+    axis: Option<[f64; 3]>,
     head_d_px: f64,
     detectable: bool,
     #[serde(default)]
@@ -698,6 +707,7 @@ impl TruthFile {
         let screws = self.screws.into_iter().map(|s| TrueScrew {
             pixel: Pixel::new(s.u, s.v),
             point: Point::new(s.xyz_mm[0], s.xyz_mm[1], s.xyz_mm[2]),
+            axis: s.axis.and_then(|[x, y, z]| Direction::new(x, y, z)),
             head_d_px: s.head_d_px,
             detectable: s.detectable,
             wear: s.tags,
@@ -782,6 +792,7 @@ impl Display for Evaluation {
             ("lateral mm", self.lateral_mm),
             ("depth mm", self.depth_mm),
             ("3D mm", self.space_mm),
+            ("normal degrees", self.normal_deg),
         ] {
             match errors {
                 Some(e) => writeln!(
@@ -874,6 +885,7 @@ mod tests {
         TrueScrew {
             pixel: Pixel::new(u_px, 100.0),
             point: Point::new(0.0, 0.0, 1500.0),
+            axis: None,
             head_d_px: 30.0,
             detectable,
             wear: vec![tag.into()],
