@@ -109,6 +109,8 @@ pub struct Evaluation {
     pub repeated: usize,
     /// Finds of verdict `review` on no cross screw: looks that a person spends for nothing.
     pub idle_reviews: usize,
+    /// Finds of verdict `other` where there is no fastener.
+    pub idle_others: usize,
     /// Screws that nobody is expected to find.
     pub undetectable: usize,
     /// Of these, found all the same.
@@ -332,6 +334,7 @@ impl<'a> Evaluator<'a> {
             false_finds: t.false_finds,
             repeated: t.repeated,
             idle_reviews: t.idle_reviews,
+            idle_others: t.idle_others,
             undetectable: t.undetectable.of,
             undetectable_found: t.undetectable.hits,
             stage_one: t.stage_one.map(|s| StageOne {
@@ -487,6 +490,7 @@ struct Tally {
     false_finds: usize,
     repeated: usize,
     idle_reviews: usize,
+    idle_others: usize,
     undetectable: Share,
     stage_one: Option<Share>,
     candidates: usize,
@@ -540,18 +544,20 @@ impl Tally {
             if !matches!(subject, Subject::Screw(k) if !truth.screws[*k].detectable) {
                 self.scores.find(find.fits, matches!(subject, Subject::Screw(_)));
             }
-            let kind = match *subject {
+            let (kind, fastener) = match *subject {
                 Subject::Screw(_) => continue,
-                Subject::Decoy(k) => truth.decoys[k].kind.as_str(),
-                Subject::Background => "background",
+                Subject::Decoy(k) => (truth.decoys[k].kind.as_str(), truth.decoys[k].drive().is_some()),
+                Subject::Background => ("background", false),
             };
-            if find.verdict != Verdict::Screw {
-                self.idle_reviews += usize::from(find.verdict == Verdict::Review);
-                continue;
+            match find.verdict {
+                Verdict::Review => self.idle_reviews += 1,
+                Verdict::Other => self.idle_others += usize::from(!fastener),
+                Verdict::Screw => {
+                    self.false_finds += 1;
+                    self.by_decoy.entry(kind.into()).or_default().false_finds += 1;
+                    list(&mut self.false_list, || FalseFind::new(&truth.picture, find, kind));
+                }
             }
-            self.false_finds += 1;
-            self.by_decoy.entry(kind.into()).or_default().false_finds += 1;
-            list(&mut self.false_list, || FalseFind::new(&truth.picture, find, kind));
         }
     }
 
@@ -775,8 +781,8 @@ impl Display for Evaluation {
         )?;
         writeln!(
             f,
-            "false        {} finds; {} reviews of what is no cross screw",
-            self.false_finds, self.idle_reviews
+            "false        {} finds; {} reviews of what is no cross screw; {} `other` of what is no fastener",
+            self.false_finds, self.idle_reviews, self.idle_others
         )?;
         writeln!(
             f,
@@ -945,6 +951,7 @@ mod tests {
             find(300.0, 300.0, Other, Drive::Torx),
             find(500.0, 300.0, Screw, Drive::Cross),
             find(900.0, 900.0, Review, Drive::Cross),
+            find(900.0, 100.0, Other, Drive::HexHead),
         ];
         let places = [
             Pixel::new(105.0, 100.0),
@@ -954,7 +961,8 @@ mod tests {
         let e = evaluation(&truth, finds, Some(&places));
         assert_eq!((e.recall.hits, e.recall.of, e.recall_or_review.hits), (1, 5, 2));
         assert_eq!((e.called_other, e.dropped, e.repeated), (1, 2, 1));
-        assert_eq!((e.undetectable, e.undetectable_found, e.idle_reviews), (1, 1, 1));
+        assert_eq!((e.undetectable, e.undetectable_found), (1, 1));
+        assert_eq!((e.idle_reviews, e.idle_others), (1, 1));
         assert_eq!((e.precision.hits, e.precision.of, e.false_finds), (1, 4, 3));
         let kinds: Vec<&str> = e.false_list.iter().map(|f| f.kind.as_str()).collect();
         assert_eq!(kinds, ["background", "hex_bolt", "rivet"]);
