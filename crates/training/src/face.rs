@@ -16,6 +16,17 @@ pub fn face_of(seed: u64) -> FaceId {
     FaceId::ALL[(seed % FaceId::ALL.len() as u64) as usize]
 }
 
+/// A drive of the scene by the detector's name for it.
+pub fn drive_seen(drive: scene::fastener::Drive) -> vision::Drive {
+    match drive {
+        scene::fastener::Drive::Cross => vision::Drive::Cross,
+        scene::fastener::Drive::Slotted => vision::Drive::Slotted,
+        scene::fastener::Drive::HexSocket => vision::Drive::HexSocket,
+        scene::fastener::Drive::Torx => vision::Drive::Torx,
+        scene::fastener::Drive::HexHead => vision::Drive::HexHead,
+    }
+}
+
 /// Renders a face; `None` where the product does not have it.
 pub fn shot(product: &Unit, face: FaceId, seed: u64) -> Option<Shot> {
     let view = FaceView::sample(product, face, seed)?;

@@ -18,6 +18,7 @@ pub use evaluate::{
     FIRST_EVALUATION_SEED, FalseFind, Miss, PhotoEvaluation, Product, Quantiles, ReliabilityBin, SceneRow, StageOne,
     evaluate_crops, evaluate_faces, evaluate_truth_folder, evaluate_yolo_folder, truth_files,
 };
+pub use face::drive_seen;
 pub use geometry::{Rate, wilson};
 pub use train::{Progress, TRAINING_SEEDS, TUNING_SEEDS, TrainError, TrainReport, TrainSettings, train};
 pub use trial::{Trial, measure_networks, try_network};

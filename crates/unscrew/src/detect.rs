@@ -1,5 +1,6 @@
 //! `unscrew detect`: the screws in photographs, as a table, as JSON lines or drawn on the picture.
 
+use crate::annotations::{self, Fastener, Format};
 use crate::{Ended, output};
 use anyhow::{Context, Result, bail};
 use calibration::Map;
@@ -45,6 +46,12 @@ pub struct Args {
     /// One JSON object a picture and line
     #[arg(long)]
     json: bool,
+    /// Write the finds of all pictures into this folder as boxes, for other tools
+    #[arg(long, value_name = "DIR")]
+    boxes: Option<PathBuf>,
+    /// Format of these boxes
+    #[arg(long, value_enum, default_value = "coco", requires = "boxes")]
+    format: Format,
 }
 
 /// `15..80`, px.
@@ -103,7 +110,7 @@ pub fn run(args: &Args) -> Result<Ended> {
         read_camera_info(path)?; // a bad camera file is said before any picture is worked on
     }
     let map = args.map.as_deref().map(Map::load).transpose()?;
-    if let Some(folder) = &args.overlay {
+    for folder in args.overlay.iter().chain(&args.boxes) {
         output::prepare_folder(folder)?;
     }
     let options = Options {
@@ -112,6 +119,7 @@ pub fn run(args: &Args) -> Result<Ended> {
     };
     let stop = output::stop_on_ctrl_c();
     let mut failed = 0;
+    let mut annotated = Vec::new();
     let mut out = std::io::stdout().lock();
     for (k, image) in args.images.iter().enumerate() {
         if stop.load(std::sync::atomic::Ordering::SeqCst) {
@@ -119,7 +127,11 @@ pub fn run(args: &Args) -> Result<Ended> {
         }
         let depth = args.depth.get(k).map(|p| (p.as_path(), args.depth_scale));
         // one bad picture does not cost the others
-        if let Err(error) = one(args, image, depth, &detector, &options, map.as_ref(), &mut out) {
+        let found = one(args, image, depth, &detector, &options, map.as_ref(), &mut out);
+        if let Ok(found) = &found {
+            annotated.push(boxes(image, found));
+        }
+        if let Err(error) = found {
             if error
                 .downcast_ref::<std::io::Error>()
                 .is_some_and(|e| e.kind() == std::io::ErrorKind::BrokenPipe)
@@ -129,6 +141,9 @@ pub fn run(args: &Args) -> Result<Ended> {
             eprintln!("unscrew: {}", output::with_causes(&error));
             failed += 1;
         }
+    }
+    if let Some(folder) = args.boxes.as_ref() {
+        annotations::write(folder, args.format, &annotated)?;
     }
     if failed > 0 {
         bail!("{failed} of {} pictures could not be used", args.images.len());
@@ -144,7 +159,7 @@ fn one(
     options: &Options,
     map: Option<&Map>,
     out: &mut impl Write,
-) -> Result<()> {
+) -> Result<Detections> {
     let begin = Instant::now();
     let frame: RgbdFrame = read_rgbd(image, depth, args.camera.as_deref())?;
     let decode_ms = begin.elapsed().as_secs_f64() * 1e3;
@@ -166,7 +181,23 @@ fn one(
         let path = folder.join(format!("{}.jpg", stem.to_string_lossy()));
         geometry::write_jpeg(&path, &vision::overlay(&frame.color, &found), 92)?;
     }
-    Ok(())
+    Ok(found)
+}
+
+/// The finds of a picture as boxes; what a person should look at is among them, with its score.
+fn boxes(image: &Path, found: &Detections) -> annotations::Picture {
+    let fastener = |screw: &Screw| Fastener {
+        drive: screw.drive,
+        center_px: [screw.pixel.u_px, screw.pixel.v_px],
+        side_px: screw.diameter_px,
+        score: Some(screw.score),
+        hidden: false,
+    };
+    annotations::Picture {
+        file: image.file_name().unwrap_or_default().to_string_lossy().into_owned(),
+        size_px: found.size_px,
+        fasteners: found.screws.iter().map(fastener).collect(),
+    }
 }
 
 fn table(out: &mut impl Write, name: &str, found: &Detections, map: Option<&Map>) -> Result<()> {

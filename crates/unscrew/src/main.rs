@@ -3,6 +3,7 @@
 //! Exit codes: 0 done; 1 could not do it (the message says what, where and what to do next); 2 wrong usage; 3 done, but
 //! the result is not good enough (screws left, verification failed).
 
+mod annotations;
 mod calibrate;
 mod curve;
 mod detect;

@@ -405,13 +405,7 @@ struct TrueDecoy {
 impl TrueDecoy {
     fn drive(&self) -> Option<Drive> {
         let known = Decoy::ALL.into_iter().find(|d| d.name() == self.kind)?;
-        known.drive().map(|drive| match drive {
-            scene::fastener::Drive::Cross => Drive::Cross,
-            scene::fastener::Drive::Slotted => Drive::Slotted,
-            scene::fastener::Drive::HexSocket => Drive::HexSocket,
-            scene::fastener::Drive::Torx => Drive::Torx,
-            scene::fastener::Drive::HexHead => Drive::HexHead,
-        })
+        known.drive().map(crate::drive_seen)
     }
 }
 
