@@ -105,7 +105,7 @@ impl Default for Inspection {
             depth_frames: 1,
             second_look_mm: 32.0,
             same_screw_mm: 4.0,
-            stuck_cover_odds: 50.0,
+            stuck_cover_odds: 150.0,
             vision_s_per_mpx: 0.05,
         }
     }

@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use vision::layout::Class;
 use vision::{
     Corrections, CueCenter, Detector, Evidence, Model, Options, Screw, Settings, Thresholds, Verdict, candidates,
-    coarse_map, cross, locate, look, normal_at, outer_circle, parallax_px,
+    coarse_map, cross, facings, locate, look, outer_circle, parallax_px,
 };
 
 /// Share of a normal distribution within one sigma.
@@ -185,20 +185,24 @@ fn cue_factors(model: &Model, shots: &[Shot], corrections: &mut Corrections) {
             .map(|c| c.pixel)
             .collect();
         let evidence = look(&model.fine, picture, &places);
-        for truth in shot.truth.screws.iter().filter(|s| s.detectable) {
-            let at = |e: &Evidence| Pixel::new(e.center.u_px, e.center.v_px);
-            let near =
-                |e: &&Evidence| at(e).distance_px(&truth.pixel) < 0.5 * truth.head_d_px && e.of(Class::Cross) > 0.5;
-            let finds = evidence.iter().filter(near);
-            let Some(find) = finds.max_by(|a, b| a.of(Class::Cross).total_cmp(&b.of(Class::Cross))) else {
-                continue;
-            };
+        let at = |e: &Evidence| Pixel::new(e.center.u_px, e.center.v_px);
+        let detectable = shot.truth.screws.iter().filter(|s| s.detectable);
+        let found: Vec<_> = detectable
+            .filter_map(|truth| {
+                let near =
+                    |e: &&Evidence| at(e).distance_px(&truth.pixel) < 0.5 * truth.head_d_px && e.of(Class::Cross) > 0.5;
+                let finds = evidence.iter().filter(near);
+                let find = finds.max_by(|a, b| a.of(Class::Cross).total_cmp(&b.of(Class::Cross)))?;
+                Some((truth, find))
+            })
+            .collect();
+        let heads: Vec<_> = found.iter().map(|(_, e)| (at(e), e.diameter_px)).collect();
+        let (Some(depth), Some(camera)) = (&shot.frame.depth, &shot.frame.camera) else {
+            continue;
+        };
+        for ((truth, find), normal) in found.iter().zip(facings(depth, camera, &heads)) {
             let (at, diameter_px) = (at(find), find.diameter_px);
-            let space = shot.frame.depth.as_ref().zip(shot.frame.camera.as_ref());
-            let parallax = space.and_then(|(depth, camera)| {
-                let normal = normal_at(depth, camera, at, diameter_px)?;
-                Some(parallax_px(camera, at, normal, diameter_px))
-            });
+            let parallax_px = normal.map_or([0.0; 2], |normal| parallax_px(camera, at, normal, diameter_px));
             let learned = CueCenter {
                 pixel: at,
                 sigma_px: find.sigma_px,
@@ -208,7 +212,7 @@ fn cue_factors(model: &Model, shots: &[Shot], corrections: &mut Corrections) {
             for (errors, cue) in cues.iter_mut().zip([Some(learned), circle, crossed]) {
                 errors.extend(cue.map(|cue| CueError {
                     off_px: [cue.pixel.u_px - truth.pixel.u_px, cue.pixel.v_px - truth.pixel.v_px],
-                    parallax_px: parallax.unwrap_or_default(),
+                    parallax_px,
                     diameter_px,
                     sigma_px: cue.sigma_px,
                 }));

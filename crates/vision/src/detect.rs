@@ -14,7 +14,7 @@ use crate::center::{Cue, CueCenter, cross, fuse, outer_circle};
 use crate::coarse::{candidates, coarse_map, suppress};
 use crate::fine::{Evidence, look};
 use crate::layout::{CLIP_PX, Class, STRIDE};
-use crate::locate::{locate, normal_at, parallax_px};
+use crate::locate::{facings, locate, parallax_px};
 use crate::picture::{Level, pyramid_scales};
 use crate::{Model, ModelError};
 
@@ -318,9 +318,11 @@ impl Detector {
         finds.retain(|f| region.contains(f.pixel) && heads.contains(&f.diameter_px));
         let finds = merge(finds);
         let start = Instant::now();
+        let parallax = parallax(&finds, space);
         let mut screws: Vec<Screw> = finds
             .par_iter()
-            .filter_map(|find| self.decide(picture, find, options, space))
+            .zip(parallax)
+            .filter_map(|(find, parallax_px)| self.decide(picture, find, options, parallax_px))
             .collect();
         let rank = |s: &Screw| match s.verdict {
             Verdict::Screw => 0,
@@ -391,13 +393,7 @@ impl Detector {
     }
 
     /// Verdict, drive and centre of a find; `None` where it is nothing.
-    fn decide(
-        &self,
-        picture: &RgbImage,
-        find: &Find,
-        options: &Options,
-        space: Option<(&DepthMap, &CameraModel)>,
-    ) -> Option<Screw> {
+    fn decide(&self, picture: &RgbImage, find: &Find, options: &Options, parallax_px: [f64; 2]) -> Option<Screw> {
         let settings = &self.model.settings;
         let probability = |drive: Drive| drive.class().map_or(0.0, |c| f64::from(find.evidence.of(c)));
         let calibrated = |p: f64| settings.corrections.probability(p);
@@ -432,12 +428,7 @@ impl Detector {
         let crossed = (drive == Drive::Cross || drive == Drive::Unknown)
             .then(|| cross(picture, find.pixel, find.diameter_px))
             .flatten();
-        let parallax = space.and_then(|(depth, camera)| {
-            let normal = normal_at(depth, camera, find.pixel, find.diameter_px)?;
-            Some(parallax_px(camera, find.pixel, normal, find.diameter_px))
-        });
-        let parallax = parallax.unwrap_or_default();
-        let fused = fuse(Some(learned), circle, crossed, parallax, &settings.corrections)?;
+        let fused = fuse(Some(learned), circle, crossed, parallax_px, &settings.corrections)?;
         let used = |cue| fused.cues.contains(&cue);
         Some(Screw {
             pixel: fused.center.pixel,
@@ -474,6 +465,21 @@ impl Detector {
         screw.sigma_lateral_mm = found.map(|f| f.sigma_lateral_mm);
         screw.sigma_depth_mm = found.map(|f| f.sigma_depth_mm);
     }
+}
+
+/// Where something one head diameter below each find's rim appears, seen from the rim, px; zero where there is no depth.
+fn parallax(finds: &[Find], space: Option<(&DepthMap, &CameraModel)>) -> Vec<[f64; 2]> {
+    let Some((depth, camera)) = space else {
+        return vec![[0.0; 2]; finds.len()];
+    };
+    let heads: Vec<(Pixel, f64)> = finds.iter().map(|f| (f.pixel, f.diameter_px)).collect();
+    let normals = facings(depth, camera, &heads);
+    let seen = |(find, normal): (&Find, Option<_>)| {
+        normal.map_or([0.0; 2], |normal| {
+            parallax_px(camera, find.pixel, normal, find.diameter_px)
+        })
+    };
+    finds.iter().zip(normals).map(seen).collect()
 }
 
 /// One find for each fastener: candidates and scales that met on the same one become the most certain of them.
@@ -540,7 +546,7 @@ mod tests {
                 ..Options::default()
             };
             detector
-                .decide(&picture, &find(50.0, 30.0, cross, slotted), &options, None)
+                .decide(&picture, &find(50.0, 30.0, cross, slotted), &options, [0.0; 2])
                 .map(|s| (s.verdict, s.drive))
         };
         assert_eq!(verdict(0.95, 0.0, Drive::Cross), Some((Verdict::Screw, Drive::Cross)));

@@ -47,7 +47,7 @@ pub use clip::Clip;
 pub use coarse::{Candidate, ProbabilityMap, candidates, coarse_map};
 pub use detect::{Detections, Detector, Drive, Options, Region, Screw, Timing, Verdict};
 pub use fine::{Evidence, look};
-pub use locate::{DepthSource, Located, locate, normal_at, parallax_px};
+pub use locate::{DepthSource, Located, facings, locate, parallax_px};
 pub use marker::{LocatedMarker, Marker, MarkerError, MarkerSpec, find_marker, locate_marker};
 pub use model::{Corrections, Model, ModelError, Settings, Thresholds, decode_model, encode_model, model_id};
 pub use overlay::{overlay, verdict_color};

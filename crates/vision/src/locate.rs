@@ -2,6 +2,7 @@
 
 use geometry::{Camera, CameraModel, DepthMap, Direction, Pixel, Point, SurfaceSample};
 use nalgebra::Vector3;
+use rayon::prelude::*;
 
 use crate::Corrections;
 
@@ -17,6 +18,10 @@ const RIM_HEIGHT: [f64; 2] = [0.27, 0.09];
 const STEEPEST: f64 = 1.0;
 /// Stereo errors of neighbouring measurements go together: so many count as one.
 const MEASUREMENTS_A_SAMPLE: f64 = 4.0;
+/// Angle to the optical axis beyond which a ring around a head has an edge in it, rad.
+const STEEPEST_SHEET: f64 = 0.5;
+/// Angle to the other heads' sheet beyond which it has too, rad.
+const SAME_SHEET: f64 = 0.12;
 
 /// What a depth rests on; the value is its place in [`Corrections::depth_rise`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -58,22 +63,29 @@ pub fn locate(
     diameter_px: f64,
     corrections: &Corrections,
 ) -> Option<Located> {
-    let ring = |ring| plane(depth, camera, pixel, diameter_px, ring);
+    let ring = |[inner, outer]: [f64; 2]| {
+        depth
+            .plane_at(pixel, inner * diameter_px, outer * diameter_px)
+            .filter(|plane| believable(plane, camera, pixel))
+    };
     let noise = |plane: &SurfaceSample| plane.sigma_mm * MEASUREMENTS_A_SAMPLE.sqrt();
-    let normal = normal_at(depth, camera, pixel, diameter_px)?;
     // Depth of the rim from that of a ring's plane: (rise, spread) in head diameters, along the normal.
     let rim = |plane: SurfaceSample, [rise, spread]: [f64; 2], source| {
         let head_mm = diameter_px * camera.pixel_mm(plane.depth_mm);
+        let normal = normal(&plane, camera, pixel)?;
         let depth_mm = plane.depth_mm - rise * head_mm * normal.vector().z.abs();
-        (plane, depth_mm, spread * head_mm, source)
+        Some((plane, depth_mm, spread * head_mm, normal, source))
     };
     let more = |[rise, spread]: [f64; 2], source| [rise + corrections.depth_rise[source as usize], spread];
-    let top = ring(TOP_RING).map(|top| rim(top, more(DOME, DepthSource::Head), DepthSource::Head));
+    let top = || rim(ring(TOP_RING)?, more(DOME, DepthSource::Head), DepthSource::Head);
     let sheet = || {
-        let rise = more(RIM_HEIGHT, DepthSource::Sheet);
-        ring(SHEET_RING).map(|sheet| rim(sheet, rise, DepthSource::Sheet))
+        rim(
+            ring(SHEET_RING)?,
+            more(RIM_HEIGHT, DepthSource::Sheet),
+            DepthSource::Sheet,
+        )
     };
-    let (plane, depth_mm, spread_mm, source) = top.or_else(sheet)?;
+    let (plane, depth_mm, spread_mm, normal, source) = top().or_else(sheet)?;
     Some(Located {
         point: camera.unproject(pixel, depth_mm),
         sigma_depth_mm: noise(&plane).hypot(spread_mm) * corrections.depth_sigma,
@@ -83,34 +95,38 @@ pub fn locate(
     })
 }
 
-/// Normal of the surface around a head, towards the camera: of the sheet, whose plane is far wider than the head's top, and of that
-/// only where the sheet has no depth.
+/// Which way the sheet looks around each of several heads on one face, towards the camera: the plane of the ring around the head, which is
+/// far wider than the head's top; where that disagrees with most of the others, an edge is in it, and the middle of all is taken.
+///
+/// # Arguments
+/// * `heads` – centre and diameter of each, px.
 ///
 /// # Returns
-/// `None` where neither has depth.
-pub fn normal_at(depth: &DepthMap, camera: &CameraModel, pixel: Pixel, diameter_px: f64) -> Option<Direction<Camera>> {
-    let of = |ring| normal(&plane(depth, camera, pixel, diameter_px, ring)?, camera, pixel);
-    of(SHEET_RING).or_else(|| of(TOP_RING))
+/// A direction for each head; `None` where no head has depth around it.
+pub fn facings(depth: &DepthMap, camera: &CameraModel, heads: &[(Pixel, f64)]) -> Vec<Option<Direction<Camera>>> {
+    let own: Vec<Option<Direction<Camera>>> = heads
+        .par_iter()
+        .map(|&(pixel, diameter_px)| {
+            let [inner, outer] = SHEET_RING.map(|r| r * diameter_px);
+            let plane = depth.plane_at(pixel, inner, outer)?;
+            normal(&plane, camera, pixel).filter(|n| n.vector().z < -STEEPEST_SHEET.cos())
+        })
+        .collect();
+    let median = |axis: usize| {
+        let mut along: Vec<f64> = own.iter().flatten().map(|n| n.vector()[axis]).collect();
+        along.sort_by(f64::total_cmp);
+        along.get(along.len() / 2).copied()
+    };
+    let all = || Direction::new(median(0)?, median(1)?, median(2)?);
+    let all = all();
+    let near = |n: &Direction<Camera>| all.is_some_and(|all| n.angle_rad(all) < SAME_SHEET);
+    own.into_iter().map(|own| own.filter(near).or(all)).collect()
 }
 
 /// Where something that lies one head diameter below the recess rim appears, seen from the rim: a pixel's offset, px.
 pub fn parallax_px(camera: &CameraModel, pixel: Pixel, normal: Direction<Camera>, diameter_px: f64) -> [f64; 2] {
     let (ray, n) = (camera.unproject(pixel, 1.0), normal.vector());
     [ray.x_mm() * n.z - n.x, ray.y_mm() * n.z - n.y].map(|shift| shift * diameter_px)
-}
-
-/// The plane of a ring around a pixel, its radii in head diameters.
-fn plane(
-    depth: &DepthMap,
-    camera: &CameraModel,
-    pixel: Pixel,
-    diameter_px: f64,
-    ring: [f64; 2],
-) -> Option<SurfaceSample> {
-    let [inner, outer] = ring.map(|r| r * diameter_px);
-    depth
-        .plane_at(pixel, inner, outer)
-        .filter(|plane| believable(plane, camera, pixel))
 }
 
 fn believable(plane: &SurfaceSample, camera: &CameraModel, pixel: Pixel) -> bool {
@@ -190,7 +206,10 @@ mod tests {
     #[test]
     fn what_lies_below_the_rim_appears_where_the_camera_sees_it() {
         let (map, camera) = scene(|_| true);
-        let normal = normal_at(&map, &camera, AT, DIAMETER_PX).expect("depth all over");
+        let [normal] = facings(&map, &camera, &[(AT, DIAMETER_PX)])[..] else {
+            panic!("one head")
+        };
+        let normal = normal.expect("depth all over");
         let rim = camera.unproject(AT, RIM_MM);
         // one head diameter along the plane's normal into the sheet, seen by the same camera
         let below = rim.vector() - normal.vector() * DIAMETER_PX * camera.pixel_mm(RIM_MM);
@@ -204,6 +223,36 @@ mod tests {
         // 0.03 and -0.02 mm a pixel of 0.32 mm
         let true_normal = Direction::new(0.094, -0.063, -1.0).expect("not zero");
         assert!(normal.angle_rad(true_normal) < 0.02, "{normal:?}");
+    }
+
+    #[test]
+    fn a_head_at_an_edge_looks_where_the_others_look() {
+        // five heads on a sheet that leans by 3 degrees; the last has a steep flank beside it
+        let camera = CameraModel::pinhole(800, 600, 4638.0, 4638.0);
+        let flank = |p: Pixel| if p.u_px > 600.0 { 0.16 * (p.u_px - 600.0) } else { 0.0 };
+        let mut map = DepthMap {
+            width: 400,
+            height: 300,
+            step: 2,
+            depth_mm: vec![0.0; 400 * 300],
+        };
+        for k in 0..map.depth_mm.len() {
+            let p = map.color_pixel(k as u32 % 400, k as u32 / 400);
+            map.depth_mm[k] = (1500.0 + 0.017 * (p.v_px - 300.0) + flank(p)) as f32;
+        }
+        let heads = [100.0, 200.0, 300.0, 400.0, 660.0].map(|u| (Pixel::new(u, 300.0), 30.0));
+        let found = facings(&map, &camera, &heads);
+        let first = found[0].expect("depth all over");
+        assert!(
+            first.angle_rad(Direction::new(0.0, 0.0526, -1.0).expect("not zero")) < 0.01,
+            "{first:?}"
+        );
+        for (k, facing) in found.iter().enumerate() {
+            assert!(
+                facing.expect("depth all over").angle_rad(first) < 0.01,
+                "{k}: {facing:?}"
+            );
+        }
     }
 
     #[test]
