@@ -91,7 +91,7 @@ pub struct Inspection {
     /// A screw seen within this distance of a target is that target, mm.
     pub same_screw_mm: f64,
     /// How much likelier a doubtful head is a screw once the cover that it may hold has not come off: a missed screw always holds
-    /// it, and of covers without one about one in fifty jams.
+    /// it, and of covers without one about one in 150 jams.
     pub stuck_cover_odds: f64,
     /// Time that is budgeted for computing on a picture, s per megapixel. Only a simulated clock needs it.
     pub vision_s_per_mpx: f64,
