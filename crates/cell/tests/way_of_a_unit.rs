@@ -30,6 +30,20 @@ fn runner_with(fake: &Fake, folder: &Path, program: Program, finder: impl cell::
     .expect("runner")
 }
 
+/// What the fake finds, with something done to it: the function is told the world and the odds.
+struct Altered<F>(Fake, F);
+
+impl<F: Fn(&Fake, f64, &mut Vec<vision::Screw>) + Send + Sync> cell::run::Finder for Altered<F> {
+    fn find(&self, frame: &geometry::RgbdFrame, odds: f64) -> Vec<vision::Screw> {
+        let mut found = self.0.find(frame, odds);
+        (self.1)(&self.0, odds, &mut found);
+        found
+    }
+    fn model(&self) -> String {
+        "altered".into()
+    }
+}
+
 fn block_on<T>(future: impl Future<Output = T>) -> T {
     let runtime = tokio::runtime::Builder::new_current_thread().build();
     runtime.expect("runtime").block_on(future)
@@ -328,29 +342,21 @@ fn a_screw_that_the_driver_only_claims_to_have_is_seen() {
 #[test]
 fn a_stuck_cover_settles_the_doubt_about_a_head() {
     // one screw of the top face is in doubt, unless there is other evidence
-    struct Doubtful(Fake);
-    impl cell::run::Finder for Doubtful {
-        fn find(&self, frame: &geometry::RgbdFrame, odds: f64) -> Vec<vision::Screw> {
-            let mut found = self.0.find(frame, odds);
-            if self.0.world().presented == "top" && odds == 1.0 {
-                let right = found.iter_mut().max_by(|a, b| a.pixel.u_px.total_cmp(&b.pixel.u_px));
-                right
-                    .into_iter()
-                    .for_each(|head| head.verdict = vision::Verdict::Review);
-            }
-            found
+    let doubt = |fake: &Fake, odds: f64, found: &mut Vec<vision::Screw>| {
+        if fake.world().presented == "top" && odds == 1.0 {
+            let right = found.iter_mut().max_by(|a, b| a.pixel.u_px.total_cmp(&b.pixel.u_px));
+            right
+                .into_iter()
+                .for_each(|head| head.verdict = vision::Verdict::Review);
         }
-        fn model(&self) -> String {
-            "doubtful".into()
-        }
-    }
+    };
     let fake = Fake::new(&[
         ("front", vec![screw(0.0, 0.0)]),
         ("top", vec![screw(0.0, 0.0), screw(90.0, 0.0)]),
     ]);
     let folder = tempfile::tempdir().expect("folder");
     let program = Program::paper().expect("built-in program");
-    let mut runner = runner_with(&fake, folder.path(), program, Doubtful(fake.clone()));
+    let mut runner = runner_with(&fake, folder.path(), program, Altered(fake.clone(), doubt));
     let record = block_on(runner.run_unit(&Silent)).expect("a record");
     assert_eq!(record.outcome, Some(Outcome::Ok));
     assert_eq!(
@@ -363,25 +369,17 @@ fn a_stuck_cover_settles_the_doubt_about_a_head() {
 #[test]
 fn a_screw_that_is_seen_but_not_met_is_searched_for_around_its_place() {
     // every centre is off by more than the bit's cone reaches
-    struct Off(Fake);
-    impl cell::run::Finder for Off {
-        fn find(&self, frame: &geometry::RgbdFrame, odds: f64) -> Vec<vision::Screw> {
-            let mut found = self.0.find(frame, odds);
-            for screw in &mut found {
-                screw.camera = screw
-                    .camera
-                    .map(|p| geometry::Point::new(p.x_mm() + 1.2, p.y_mm(), p.z_mm()));
-            }
-            found
+    let off = |_: &Fake, _: f64, found: &mut Vec<vision::Screw>| {
+        for screw in found {
+            screw.camera = screw
+                .camera
+                .map(|p| geometry::Point::new(p.x_mm() + 1.2, p.y_mm(), p.z_mm()));
         }
-        fn model(&self) -> String {
-            "off".into()
-        }
-    }
+    };
     let fake = Fake::new(&[("front", vec![screw(10.0, 20.0)])]);
     let folder = tempfile::tempdir().expect("folder");
     let program = Program::paper().expect("built-in program");
-    let mut runner = runner_with(&fake, folder.path(), program, Off(fake.clone()));
+    let mut runner = runner_with(&fake, folder.path(), program, Altered(fake.clone(), off));
     let record = block_on(runner.run_unit(&Silent)).expect("a record");
     assert_eq!(record.outcome, Some(Outcome::Ok));
     assert_eq!((fake.standing(), record.screws_out()), (0, 1));

@@ -467,7 +467,8 @@ impl Detector {
     }
 }
 
-/// Where something one head diameter below each find's rim appears, seen from the rim, px; zero where there is no depth.
+/// Where something one head diameter below each find's rim appears, seen from the rim, px; zero where there is no depth. Every candidate
+/// has a say in where the face looks, screw or not.
 fn parallax(finds: &[Find], space: Option<(&DepthMap, &CameraModel)>) -> Vec<[f64; 2]> {
     let Some((depth, camera)) = space else {
         return vec![[0.0; 2]; finds.len()];
