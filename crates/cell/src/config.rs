@@ -93,6 +93,8 @@ pub struct Inspection {
     /// How much likelier a doubtful head is a screw once the cover that it may hold has not come off: a missed screw always holds
     /// it, and of covers without one about one in 150 jams.
     pub stuck_cover_odds: f64,
+    /// Heads at most that are tried on such a face for no other reason, the likeliest first.
+    pub doubtful_max: usize,
     /// Time that is budgeted for computing on a picture, s per megapixel. Only a simulated clock needs it.
     pub vision_s_per_mpx: f64,
 }
@@ -106,6 +108,7 @@ impl Default for Inspection {
             second_look_mm: 32.0,
             same_screw_mm: 4.0,
             stuck_cover_odds: 150.0,
+            doubtful_max: 3,
             vision_s_per_mpx: 0.05,
         }
     }

@@ -130,6 +130,26 @@ pub struct Reach<'a> {
     pub map: &'a Map,
 }
 
+/// True if the picture alone rather says that it is no screw: only the odds of a stuck cover speak for it.
+///
+/// # Arguments
+/// * `fits` – probability with the odds.
+/// * `odds` – how much likelier other evidence makes it than the picture says.
+pub fn is_doubtful(fits: f64, odds: f64) -> bool {
+    fits < odds * (1.0 - fits)
+}
+
+/// Leaves of the doubtful heads the `most` likely ones; the others are for a person to look at. One missed screw holds a cover: that is
+/// evidence for the best few, not for every crossing of a grille.
+pub fn bound_doubtful(screws: &mut [vision::Screw], odds: f64, most: usize) {
+    let doubtful = screws.iter_mut().filter(|s| s.verdict == Verdict::Screw && is_doubtful(s.fits, odds));
+    let mut doubtful: Vec<_> = doubtful.collect();
+    doubtful.sort_by(|a, b| b.fits.total_cmp(&a.fits));
+    for screw in doubtful.into_iter().skip(most) {
+        screw.verdict = Verdict::Review;
+    }
+}
+
 /// Turns the detector's finds into records and targets.
 ///
 /// # Returns
@@ -181,7 +201,7 @@ fn judge(
         sigma_lateral_mm: mapped.map(|m| m.sigma_lateral_mm.hypot(screw.sigma_lateral_mm.unwrap_or(0.0))),
         sigma_depth_mm: mapped.map(|m| m.sigma_depth_mm.hypot(screw.sigma_depth_mm.unwrap_or(0.0))),
         hull: mapped.map(|m| m.hull),
-        tilt_rad: leaning(sheet, screw.normal),
+        tilt_rad: leaning(sheet, screw.top_normal),
         left_alone: None,
     };
     let place = target(screw, &found, shot, sheet, face, arms, config);
@@ -225,7 +245,7 @@ fn target(
     {
         return Err(LeftAlone::Bent);
     }
-    let normal = line_of_approach(sheet, screw.normal, face, config).ok_or(LeftAlone::NoDepth)?;
+    let normal = line_of_approach(sheet, screw.top_normal, face, config).ok_or(LeftAlone::NoDepth)?;
     let mut refused = LeftAlone::HullOutside;
     for reach in arms {
         match SafeTarget::locate(reach.map, reach.arm, point, normal, config.approach.standoff_mm) {

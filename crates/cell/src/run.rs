@@ -466,7 +466,9 @@ impl Way<'_> {
         self.turn(face).await?;
         let config = self.runner.config.clone();
         let shot = shoot(&self.runner.devices, None, config.inspection.depth_frames).await?;
-        let screws = self.runner.finder.find(&shot.frame, self.odds(purpose));
+        let odds = self.odds(purpose);
+        let mut screws = self.runner.finder.find(&shot.frame, odds);
+        plan::bound_doubtful(&mut screws, odds, config.inspection.doubtful_max);
         self.budget(&shot);
         let heads: Vec<(Pixel, f64)> = screws.iter().map(|s| (s.pixel, s.diameter_px)).collect();
         let fit = FaceFit::around(&shot.frame, &heads, config.inspection.working_depth_mm);
@@ -478,7 +480,7 @@ impl Way<'_> {
         let heads = screws
             .iter()
             .filter(|s| s.verdict == Verdict::Screw)
-            .filter_map(|s| s.normal);
+            .filter_map(|s| s.top_normal);
         let plane = fit.as_ref().and_then(|fit| {
             let heads_lean_rad = fit.lean_rad(heads);
             fit.plane().map(|plane| FacePlane {
@@ -553,6 +555,12 @@ impl Way<'_> {
         purpose.map_or(1.0, |purpose| self.odds(purpose))
     }
 
+    /// True if a find of the face that is being worked on is a target only because its cover did not come off.
+    fn is_doubtful(&self, found: usize) -> bool {
+        let find = self.record.faces.last().and_then(|f| f.found.get(found));
+        find.is_some_and(|find| plan::is_doubtful(find.score, self.face_odds()))
+    }
+
     /// Lets the time pass that computing on a picture is budgeted with.
     fn budget(&self, shot: &Shot) {
         let per_mpx = self.runner.config.inspection.vision_s_per_mpx;
@@ -592,7 +600,9 @@ impl Way<'_> {
             Retry::LookAgain(program) => {
                 if let Some((place, picture)) = self.second_look(target, shot).await? {
                     let end = self.burst(target.found, place, program, Some(picture)).await?;
-                    self.search(target.found, place, program, end).await?;
+                    if !self.is_doubtful(target.found) {
+                        self.search(target.found, place, program, end).await?;
+                    }
                 }
             }
         }

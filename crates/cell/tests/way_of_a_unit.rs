@@ -6,7 +6,7 @@ use cell::config::CellConfig;
 use cell::device::DriveEnd;
 use cell::journal::Journal;
 use cell::program::Program;
-use cell::record::{Act, ExclusionReason, LeftAlone, NgReason, Outcome, PullEnd, SeenBy, UnitRecord};
+use cell::record::{Act, ExclusionReason, LeftAlone, NgReason, Outcome, PullEnd, Purpose, SeenBy, UnitRecord};
 use cell::run::{RunError, Runner, Silent};
 use fake::{Fake, base_from_camera, map, screw, screw_that_ends, volume};
 use geometry::Point;
@@ -364,6 +364,47 @@ fn a_stuck_cover_settles_the_doubt_about_a_head() {
         ["PULL_TOP", "PULL_TOP", "PULL_FRONT", "PULL_RIGHT"]
     );
     assert!(record.times.recovery_s > 5.0);
+}
+
+#[test]
+fn on_a_stuck_cover_only_the_likeliest_doubtful_heads_are_tried() {
+    // the top has a screw that nobody sees, and a grille whose crossings the odds of a stuck cover make screws
+    let grille = |fake: &Fake, odds: f64, found: &mut Vec<vision::Screw>| {
+        if fake.world().presented != "top" {
+            return;
+        }
+        let unseen = found.iter().position(|screw| screw.camera.is_some_and(|p| p.x_mm() > 60.0));
+        let Some(unseen) = unseen.map(|k| found.remove(k)).filter(|_| odds > 1.0) else {
+            return;
+        };
+        found.extend((1..=10).map(|k| {
+            let aside = f64::from(k);
+            vision::Screw {
+                pixel: geometry::Pixel::new(unseen.pixel.u_px, unseen.pixel.v_px + 25.0 * aside),
+                camera: unseen
+                    .camera
+                    .map(|p| geometry::Point::new(p.x_mm(), p.y_mm() + 8.0 * aside, p.z_mm())),
+                score: 0.9 - 0.001 * aside,
+                fits: 0.9 - 0.001 * aside,
+                ..unseen.clone()
+            }
+        }));
+    };
+    let fake = Fake::new(&[
+        ("front", vec![screw(0.0, 0.0)]),
+        ("top", vec![screw(0.0, 0.0), screw(90.0, 0.0)]),
+    ]);
+    let folder = tempfile::tempdir().expect("folder");
+    let program = Program::paper().expect("built-in program");
+    let mut runner = runner_with(&fake, folder.path(), program, Altered(fake.clone(), grille));
+    let record = block_on(runner.run_unit(&Silent)).expect("a record");
+    assert!(matches!(record.outcome, Some(Outcome::Ng { .. })), "{:?}", record.outcome);
+    let second = record.faces.iter().find(|f| f.purpose == Purpose::Missed);
+    let second = second.expect("a second look at the stuck cover");
+    assert_eq!(second.attempts.len(), 3, "the others are left to a person");
+    let tried: Vec<f64> = second.attempts.iter().map(|a| second.found[a.found].score).collect();
+    assert!(tried.iter().all(|score| *score > 0.8965), "{tried:?}");
+    assert!(second.attempts.iter().all(|a| a.bursts.len() <= 2), "no search around what is doubtful");
 }
 
 #[test]

@@ -121,7 +121,7 @@ impl Default for TrainSettings {
             coarse_steps: 1900,
             fine_steps: 11000,
             shared_steps: 9500,
-            tuning_faces: 100,
+            tuning_faces: 150,
             seed: 1,
             from: None,
             from_model: None,

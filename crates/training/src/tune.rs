@@ -19,12 +19,15 @@ const ENOUGH: usize = 20;
 const CUE_FACES: usize = 40;
 /// A cue farther off than this has met something else, in head diameters.
 const GROSS: f64 = 0.15;
-/// Cost of a screw that is not found, in units of one miss.
+/// Scores below this are left out of the calibration: hundreds of candidates that are surely nothing would rule a curve that is there for
+/// the doubtful ones.
+const DOUBTFUL_FROM: f64 = 0.02;
+/// Cost of a screw that is not found, in units of one miss: its cover stays, and the face is looked at again or the unit fails.
 const MISS: f64 = 1.0;
-/// Cost of something taken for a screw: a burst on what is none, and a mark on the part. A missed screw costs the unit.
-const FALSE_FIND: f64 = 1.5;
+/// Cost of something taken for a screw: a burst of some seconds on what is none, and a mark on a part that is scrap.
+const FALSE_FIND: f64 = 0.5;
 /// Cost of a look by a person; unattended, the head is left alone until its cover tells.
-const LOOK: f64 = 0.3;
+const LOOK: f64 = 0.2;
 
 /// What was chosen, and by which figures.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -251,6 +254,7 @@ fn below_rim(errors: &[CueError]) -> f64 {
 /// [`Corrections::score`] by which the scores are likeliest, with targets that guard against overconfidence (Platt 1999).
 fn calibration(scores: &[(f64, bool)]) -> [f64; 3] {
     let start = Vector3::from(Corrections::default().score);
+    let scores: Vec<_> = scores.iter().filter(|s| s.0 >= DOUBTFUL_FROM).collect();
     let real = scores.iter().filter(|s| s.1).count() as f64;
     let not = scores.len() as f64 - real;
     if real < 10.0 || not < 10.0 {
@@ -262,7 +266,7 @@ fn calibration(scores: &[(f64, bool)]) -> [f64; 3] {
         // Newton's step on the cross-entropy, with a little weight on the slopes' staying where they are
         let stay = Vector3::new(0.1, 0.1, 1e-6);
         let (mut slope, mut bend) = (stay.component_mul(&(curve - start)), Matrix3::from_diagonal(&stay));
-        for &(score, real) in scores {
+        for &&(score, real) in &scores {
             let score = score.clamp(1e-7, 1.0 - 1e-7);
             let terms = Vector3::new(score.ln(), -(1.0 - score).ln(), 1.0);
             let p = 1.0 / (1.0 + (-terms.dot(&curve)).exp());

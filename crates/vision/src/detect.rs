@@ -14,7 +14,7 @@ use crate::center::{Cue, CueCenter, cross, fuse, outer_circle};
 use crate::coarse::{candidates, coarse_map, suppress};
 use crate::fine::{Evidence, look};
 use crate::layout::{CLIP_PX, Class, STRIDE};
-use crate::locate::{facings, locate, parallax_px};
+use crate::locate::{DepthSource, facings, locate, parallax_px};
 use crate::picture::{Level, pyramid_scales};
 use crate::{Model, ModelError};
 
@@ -167,8 +167,10 @@ pub struct Screw {
     pub angle_rad: Option<f64>,
     /// Centre of the recess in space, where there is depth and a camera model.
     pub camera: Option<Point<Camera>>,
-    /// Normal of the surface there, towards the camera.
+    /// Normal of the sheet around it, towards the camera: the axis of a screw that is seated straight.
     pub normal: Option<Direction<Camera>>,
+    /// Normal of the head's top, towards the camera: measured apart from the sheet, on fewer points and so less exactly.
+    pub top_normal: Option<Direction<Camera>>,
     /// Standard error across the optical axis, along each axis, mm.
     pub sigma_lateral_mm: Option<f64>,
     /// Standard error along the optical axis, mm.
@@ -318,11 +320,16 @@ impl Detector {
         finds.retain(|f| region.contains(f.pixel) && heads.contains(&f.diameter_px));
         let finds = merge(finds);
         let start = Instant::now();
-        let parallax = parallax(&finds, space);
         let mut screws: Vec<Screw> = finds
             .par_iter()
-            .zip(parallax)
-            .filter_map(|(find, parallax_px)| self.decide(picture, find, options, parallax_px))
+            .zip(sheet_normals(&finds, space))
+            .filter_map(|(find, normal)| {
+                let parallax_px = space.zip(normal).map_or([0.0; 2], |((_, camera), normal)| {
+                    parallax_px(camera, find.pixel, normal, find.diameter_px)
+                });
+                let screw = self.decide(picture, find, options, parallax_px)?;
+                Some(Screw { normal, ..screw })
+            })
             .collect();
         let rank = |s: &Screw| match s.verdict {
             Verdict::Screw => 0,
@@ -444,6 +451,7 @@ impl Detector {
             cues: fused.cues,
             camera: None,
             normal: None,
+            top_normal: None,
             sigma_lateral_mm: None,
             sigma_depth_mm: None,
         })
@@ -461,26 +469,20 @@ impl Detector {
             corrections,
         );
         screw.camera = found.map(|f| f.point);
-        screw.normal = found.map(|f| f.normal);
+        screw.top_normal = found.filter(|f| f.source == DepthSource::Head).map(|f| f.normal);
+        screw.normal = screw.normal.or(found.map(|f| f.normal));
         screw.sigma_lateral_mm = found.map(|f| f.sigma_lateral_mm);
         screw.sigma_depth_mm = found.map(|f| f.sigma_depth_mm);
     }
 }
 
-/// Where something one head diameter below each find's rim appears, seen from the rim, px; zero where there is no depth. Every candidate
-/// has a say in where the face looks, screw or not.
-fn parallax(finds: &[Find], space: Option<(&DepthMap, &CameraModel)>) -> Vec<[f64; 2]> {
+/// Which way the sheet looks around each find, where there is depth. Every candidate has a say in where the face looks, screw or not.
+fn sheet_normals(finds: &[Find], space: Option<(&DepthMap, &CameraModel)>) -> Vec<Option<Direction<Camera>>> {
     let Some((depth, camera)) = space else {
-        return vec![[0.0; 2]; finds.len()];
+        return vec![None; finds.len()];
     };
     let heads: Vec<(Pixel, f64)> = finds.iter().map(|f| (f.pixel, f.diameter_px)).collect();
-    let normals = facings(depth, camera, &heads);
-    let seen = |(find, normal): (&Find, Option<_>)| {
-        normal.map_or([0.0; 2], |normal| {
-            parallax_px(camera, find.pixel, normal, find.diameter_px)
-        })
-    };
-    finds.iter().zip(normals).map(seen).collect()
+    facings(depth, camera, &heads)
 }
 
 /// One find for each fastener: candidates and scales that met on the same one become the most certain of them.

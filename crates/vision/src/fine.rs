@@ -34,7 +34,7 @@ pub struct Evidence {
     pub sigma_px: f64,
     /// Diameter of the head, px.
     pub diameter_px: f64,
-    /// Mean probability of each [`Class`] around the centre.
+    /// Probability of each [`Class`]: geometric mean over the cells around the centre, networks and views.
     pub probability: [f32; CLASSES],
 }
 
@@ -86,8 +86,21 @@ fn mean(looks: &[&Evidence]) -> Evidence {
         center,
         sigma_px: (share * (over(&|e| e.sigma_px.powi(2)) + spread)).sqrt(),
         diameter_px: over(&|e| e.diameter_px.ln()).exp(),
-        probability: std::array::from_fn(|c| over(&|e| f64::from(e.probability[c])) as f32),
+        probability: normalized(std::array::from_fn(|c| over(&|e| f64::from(ln(e.probability[c]))) as f32)),
     }
+}
+
+/// Logarithm of a probability, bounded: one cell that is sure of the contrary does not decide alone.
+fn ln(probability: f32) -> f32 {
+    probability.max(1e-6).ln()
+}
+
+/// Probabilities from their logarithms up to a constant.
+fn normalized(ln: [f32; CLASSES]) -> [f32; CLASSES] {
+    let high = ln.iter().copied().fold(f32::MIN, f32::max);
+    let odds = ln.map(|l| (l - high).exp());
+    let sum: f32 = odds.iter().sum();
+    odds.map(|o| o / sum)
 }
 
 fn look_once(networks: &[Network], picture: &RgbImage, places: &[Pixel<space::Clip>], sign: [i64; 2]) -> Vec<Evidence> {
@@ -231,9 +244,9 @@ fn near(votes: &[Vote], center: [f64; 2], reach: f64) -> impl Iterator<Item = (&
     })
 }
 
-/// Mean class probabilities over the cells within `radius` of the centre, the four around it always included.
+/// Geometric mean of the classes' probabilities over the cells within `radius` of the centre, the four around it always included.
 fn class_means(map: &[f32], center: [f64; 2], radius: f64) -> [f32; CLASSES] {
-    let mut mean = [0f32; CLASSES];
+    let mut logs = [0f32; CLASSES];
     let mut sum = 0.0;
     let radius = radius.max(0.75 * cell_center_px(1));
     for (i, cell) in map.chunks_exact(FINE_CHANNELS).enumerate() {
@@ -241,18 +254,17 @@ fn class_means(map: &[f32], center: [f64; 2], radius: f64) -> [f32; CLASSES] {
         // Cells fade out over one cell's width: the mean changes smoothly with the centre.
         let weight = ((radius - off) / cell_center_px(1) + 0.5).clamp(0.0, 1.0) as f32;
         if weight > 0.0 {
-            for (m, p) in mean.iter_mut().zip(cell) {
-                *m += weight * p;
+            for (log, p) in logs.iter_mut().zip(cell) {
+                *log += weight * ln(*p);
             }
             sum += weight;
         }
     }
-    if sum > 0.0 {
-        mean.iter_mut().for_each(|m| *m /= sum);
-    } else {
-        mean[Class::Background.channel()] = 1.0; // the votes left the clip
+    if sum == 0.0 {
+        // the votes left the clip
+        return std::array::from_fn(|c| f32::from(u8::from(c == Class::Background.channel())));
     }
-    mean
+    normalized(logs.map(|log| log / sum))
 }
 
 #[cfg(test)]
@@ -264,7 +276,8 @@ mod tests {
         let mut map = vec![0f32; MAP_CELLS * MAP_CELLS * FINE_CHANNELS];
         for (i, cell) in map.chunks_exact_mut(FINE_CHANNELS).enumerate() {
             let [u, v] = [cell_center_px(i % MAP_CELLS), cell_center_px(i / MAP_CELLS)];
-            let inside = (u - at[0]).hypot(v - at[1]) < 0.28 * diameter_px;
+            // what is not told where the item ends goes on a little beyond the labelled disc
+            let inside = (u - at[0]).hypot(v - at[1]) < 0.4 * diameter_px;
             cell[Class::Cross.channel()] = if inside { 0.97 } else { 0.0 };
             cell[Class::Background.channel()] = if inside { 0.03 } else { 1.0 };
             cell[OFFSET_U] = ((at[0] + shift - u) / OFFSET_UNIT_PX) as f32;

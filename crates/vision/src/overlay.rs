@@ -111,6 +111,7 @@ mod tests {
             angle_rad: None,
             camera: None,
             normal: None,
+            top_normal: None,
             sigma_lateral_mm: None,
             sigma_depth_mm: None,
         };

@@ -161,6 +161,7 @@ mod tests {
             angle_rad: None,
             camera: Some(Point::new(-233.1, -198.7, 1480.1)),
             normal: None,
+            top_normal: None,
             sigma_lateral_mm: Some(0.07),
             sigma_depth_mm: Some(0.11),
         };

@@ -298,11 +298,12 @@ impl DepthCamera for FakeDepth {
 }
 
 impl Finder for Fake {
-    fn find(&self, frame: &RgbdFrame, _odds: f64) -> Vec<vision::Screw> {
+    fn find(&self, frame: &RgbdFrame, odds: f64) -> Vec<vision::Screw> {
         let world = self.world();
         let tilt = world.tilt_rad.get(&world.presented).copied().unwrap_or(0.0);
         let lean = world.lean_rad.get(&world.presented).copied().unwrap_or(0.0);
         let Some(part) = frame.camera else { return Vec::new() };
+        let fits = 0.95 * odds / (0.95 * odds + 0.05);
         let heads = world.faces.get(&world.presented).cloned().unwrap_or_default();
         heads
             .iter()
@@ -314,14 +315,15 @@ impl Finder for Fake {
                     pixel,
                     sigma_px: 0.2,
                     diameter_px: 9.0 / part.pixel_mm(point.z_mm()),
-                    score: 0.95,
-                    fits: 0.95,
+                    score: fits,
+                    fits,
                     drive: vision::Drive::Cross,
                     verdict: head.verdict,
                     cues: Vec::new(),
                     angle_rad: None,
                     camera: frame.depth.as_ref().map(|_| point),
                     normal: Direction::from_vector(normal(tilt + lean)),
+                    top_normal: Direction::from_vector(normal(tilt + lean)),
                     sigma_lateral_mm: Some(0.1),
                     sigma_depth_mm: Some(0.1),
                 })

@@ -310,6 +310,7 @@ mod tests {
             angle_rad: None,
             camera: Some(Point::new(0.3, 0.4, 1501.2)),
             normal: None,
+            top_normal: None,
             sigma_lateral_mm: Some(0.1),
             sigma_depth_mm: Some(1.0),
         }
