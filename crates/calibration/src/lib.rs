@@ -3,7 +3,8 @@
 //! Between finding a screw in the camera's frame and driving to it stands this crate. [`lattice`] says where the marker goes,
 //! a capture appends a [`Pair`] for every visit ([`PairWriter`]), [`Map::fit`] makes of them a [`Map`], and [`Map::apply`] turns a
 //! `Point<Camera>` into a `Point<Base>` with a sigma across and along the viewing ray and a word on whether it lies in the
-//! calibrated volume. [`verify`] tells from fresh pairs whether a map still holds. It uses only `geometry`.
+//! calibrated volume. [`verify`] tells from fresh pairs whether a map still holds; [`Map::realign`] makes it true again after a bump or a
+//! crash, and [`Map::correct`] takes out what a needle shows to be left. It uses only `geometry`.
 //!
 //! Two methods stand side by side. `gp`, the default, is a Gaussian process of what a rigid motion leaves, across and along the
 //! viewing ray, with waves of the joint angles for the ripple of the gears: 100 points do. `lattice` is the paper's Algorithm 2
@@ -42,18 +43,22 @@
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
 
+mod correct;
 mod gp;
 mod lattice;
 mod map;
 mod pair;
 mod plan;
+mod realign;
 mod report;
 mod rigid;
 mod ripple;
 
+pub use correct::{Between, CorrectError, Mark};
 pub use lattice::Level;
 pub use map::{Hull, Identity, Map, MapError, MappedPoint, Method, Settings, camera_identity};
-pub use pair::{Pair, PairError, PairWriter, Query, read_pairs, read_queries, write_pairs};
+pub use pair::{Pair, PairError, PairWriter, Query, read_marks, read_pairs, read_queries, write_pairs};
 pub use plan::{PlanError, Target, Volume, lattice, node_counts, scattered};
+pub use realign::{Moved, RealignError, Realignment};
 pub use report::{Figures, FitReport, Rejected, Spread, Verification, verify};
 pub use rigid::FitError;

@@ -3,8 +3,10 @@
 use crate::{
     Figures, FitError, FitReport, Level, Pair, Rejected, Volume,
     gp::{self, Choice, Gp},
+    correct,
     lattice::{Estimate, Grid, LEVELS, MAX_LEVERAGE, Model, Shape, believable, split},
-    pair,
+    pair, realign,
+    ripple::Ripple,
     rigid::{self, Points, quantile},
 };
 use geometry::{Base, Camera, CameraModel, Point, Transform};
@@ -156,7 +158,9 @@ pub enum MapError {
 }
 
 const FORMAT: &str = "unscrew-map";
-const VERSION: u64 = 2;
+const VERSION: u64 = 3;
+/// What a map without layers is written as: programs of before read it.
+const VERSION_WITHOUT_LAYERS: u64 = 2;
 
 /// Standard deviation of one measurement about the map for each level of the fallback: across the ray and along it, mm.
 type Scales = [[f64; 2]; 4];
@@ -185,6 +189,12 @@ struct MapFile {
     /// What a Gaussian process rests on beside the points.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     gp: Option<Choice>,
+    /// What has moved since.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    realigned: Option<realign::Layer>,
+    /// What a needle showed to be left.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    correction: Option<correct::Layer>,
     grid: Grid,
     points: Vec<Support>,
 }
@@ -307,7 +317,7 @@ impl Map {
             .fold((command[0], command[0]), |(l, h), p| (l.inf(p), h.sup(p)));
         let file = MapFile {
             format: FORMAT.into(),
-            version: VERSION,
+            version: VERSION_WITHOUT_LAYERS,
             made_by: concat!("unscrew ", env!("CARGO_PKG_VERSION")).into(),
             pairs_sha256: format!("sha256:{}", geometry::sha256_hex(pair::to_csv(pairs).as_bytes())),
             settings: settings.clone(),
@@ -317,6 +327,8 @@ impl Map {
             volume: Volume::between(Point::from_vector(low), Point::from_vector(high)),
             scales_mm: scales(&model, &camera, &command, &held),
             gp: fitted.as_ref().map(|f| f.choice.clone()),
+            realigned: None,
+            correction: None,
             grid: model.grid.clone(),
             points: used.iter().zip(camera.iter().zip(&command)).map(support).collect(),
         };
@@ -326,6 +338,35 @@ impl Map {
 
     /// Where a camera point is in the robot's base frame.
     pub fn apply(&self, camera: Point<Camera>) -> MappedPoint {
+        let Some(layer) = &self.file.realigned else {
+            return self.corrected(self.as_fitted(camera));
+        };
+        let then = layer.before(camera);
+        let mapped = self.as_fitted(then);
+        let base = mapped.base.vector();
+        let rotation = self.model.motion.rotation.to_rotation_matrix();
+        let [lateral, depth] = layer.variance(rotation.matrix(), then.vector(), base);
+        self.corrected(MappedPoint {
+            base: Point::from_vector(base + layer.after(base)),
+            sigma_lateral_mm: (mapped.sigma_lateral_mm.powi(2) + lateral).sqrt(),
+            sigma_depth_mm: (mapped.sigma_depth_mm.powi(2) + depth).sqrt(),
+            hull: mapped.hull,
+        })
+    }
+
+    fn corrected(&self, mapped: MappedPoint) -> MappedPoint {
+        let Some(layer) = &self.file.correction else {
+            return mapped;
+        };
+        let base = mapped.base.vector();
+        MappedPoint {
+            base: Point::from_vector(base + layer.at(base)),
+            ..mapped
+        }
+    }
+
+    /// As it was when it was fitted.
+    fn as_fitted(&self, camera: Point<Camera>) -> MappedPoint {
         let e = self.model.estimate(camera.vector());
         // nothing measured supports a point outside or in a hole: its sigma grows with the distance
         let beyond = 1.0 + e.outside.max(e.nearest.clamp(1.0, 2.0) - 1.0);
@@ -437,6 +478,35 @@ impl Map {
             });
         }
         Ok(map)
+    }
+
+    pub(crate) fn with_layer(&self, layer: realign::Layer) -> Self {
+        let mut map = self.clone();
+        (map.file.version, map.file.realigned) = (VERSION, Some(layer));
+        map
+    }
+
+    pub(crate) fn with_correction(&self, layer: correct::Layer) -> Self {
+        let mut map = self.clone();
+        (map.file.version, map.file.correction) = (VERSION, Some(layer));
+        map
+    }
+
+    /// The map as before any realignment.
+    pub(crate) fn without_realignment(&self) -> Self {
+        let mut map = self.clone();
+        map.file.realigned = None;
+        map
+    }
+
+    /// What the last realignment found.
+    pub fn realigned(&self) -> Option<&realign::Realignment> {
+        self.file.realigned.as_ref().map(|layer| &layer.told)
+    }
+
+    /// The arm's lengths and tool, where ripple was found.
+    pub(crate) fn arm(&self) -> Option<&Ripple> {
+        self.file.gp.as_ref()?.ripple.as_ref()
     }
 
     /// The arm and the camera that the map is true for.

@@ -1,5 +1,6 @@
 //! Calibration pairs and their CSV files: what a capture records, one row a visit, misses included.
 
+use crate::Mark;
 use geometry::{Base, Camera, Pixel, Point};
 use std::{
     collections::HashMap,
@@ -210,6 +211,34 @@ pub fn read_queries(path: &Path) -> Result<Vec<Query>, PairError> {
                 pixel: row.pixel(valid)?,
                 camera: row.camera(valid)?,
                 valid,
+            })
+        })
+        .collect()
+}
+
+/// Reads needle marks: `id`, `target_*_mm` and `mark_*_mm`, base frame.
+///
+/// # Errors
+/// As for [`read_pairs`].
+pub fn read_marks(path: &Path) -> Result<Vec<Mark>, PairError> {
+    const TARGET: [&str; 3] = ["target_x_mm", "target_y_mm", "target_z_mm"];
+    const MARK: [&str; 3] = ["mark_x_mm", "mark_y_mm", "mark_z_mm"];
+    let table = Table::read(path)?;
+    for column in ["id"].into_iter().chain(TARGET).chain(MARK) {
+        table.require(column)?;
+    }
+    table
+        .rows()
+        .map(|row| {
+            let row = row?;
+            let point = |columns: [&'static str; 3]| match row.group(columns, |r, c| r.number(c))? {
+                Some([x, y, z]) => Ok(Point::new(x, y, z)),
+                None => Err(row.value_error(columns[0], "is empty: every row has its target and its mark")),
+            };
+            Ok(Mark {
+                id: row.id()?,
+                target: point(TARGET)?,
+                mark: point(MARK)?,
             })
         })
         .collect()

@@ -228,7 +228,7 @@ pub(crate) fn robust_rigid(points: &Points) -> Result<Isometry3<f64>, FitError> 
     Ok(motion)
 }
 
-fn least_median(from: &[Vector3<f64>], to: &[Vector3<f64>]) -> (Isometry3<f64>, f64) {
+pub(crate) fn least_median(from: &[Vector3<f64>], to: &[Vector3<f64>]) -> (Isometry3<f64>, f64) {
     let n = from.len();
     let residuals = |m: &Isometry3<f64>| -> Vec<f64> {
         from.iter()

@@ -1,9 +1,10 @@
-//! `unscrew calibrate`: plan, capture, fit, apply, verify.
+//! `unscrew calibrate`: plan, capture, fit, apply, verify, realign, correct.
 
 use crate::{Ended, output};
 use anyhow::{Result, bail};
 use calibration::{
-    Identity, Map, Method, PlanError, Settings, Target, Volume, lattice, read_pairs, read_queries, scattered, verify,
+    Between, Identity, Map, Method, Moved, PlanError, Settings, Target, Volume, lattice, read_marks, read_pairs,
+    read_queries, scattered, verify,
 };
 use geometry::{Base, Point};
 use serde::Serialize;
@@ -27,6 +28,14 @@ pub enum Command {
     /// Check a map against fresh pairs
     #[command(after_help = "Example: unscrew calibrate verify --map map_a.json fresh_pairs.csv --limit-mm 0.35")]
     Verify(Verify),
+    /// Make a map true again after a bump or a crash, from 5 to 20 fresh pairs
+    #[command(after_help = "Example: unscrew calibrate realign --map map_a.json fresh_pairs.csv --out map_a.json")]
+    Realign(Realign),
+    /// Lay a correction over a map: what a needle on millimetre paper showed to be left
+    #[command(
+        after_help = "Example: unscrew calibrate correct --map map_a.json marks.csv --out map_a.json\n\nmarks.csv: id,target_x_mm,target_y_mm,target_z_mm,mark_x_mm,mark_y_mm,mark_z_mm (base frame; the map's answer, and where the needle stood)"
+    )]
+    Correct(Correct),
 }
 
 /// Where the marker goes.
@@ -125,6 +134,60 @@ pub struct Verify {
     json: bool,
 }
 
+#[derive(clap::Args)]
+pub struct Realign {
+    /// Map file
+    #[arg(long, value_name = "FILE")]
+    map: PathBuf,
+    /// Fresh pairs (CSV)
+    pairs: PathBuf,
+    /// Map file to write; may be the same
+    #[arg(long, value_name = "FILE")]
+    out: PathBuf,
+    /// What may have moved: shift (5 points), pose (10) or pose-and-zeros (20, with joint angles). Left out: as many as the points tell
+    #[arg(long, value_parser = moved)]
+    moved: Option<Moved>,
+    /// Good enough if 95 % of the errors that are left are at most this, mm
+    #[arg(long, default_value_t = 0.35)]
+    limit_mm: f64,
+    /// As JSON
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(clap::Args)]
+pub struct Correct {
+    /// Map file
+    #[arg(long, value_name = "FILE")]
+    map: PathBuf,
+    /// Targets and marks (CSV)
+    marks: PathBuf,
+    /// Map file to write; may be the same
+    #[arg(long, value_name = "FILE")]
+    out: PathBuf,
+    /// What holds between the targets: interpolated, or nearest as in the paper
+    #[arg(long, default_value = "interpolated", value_parser = between)]
+    between: Between,
+    /// How far from a target its mark still says something, mm
+    #[arg(long, default_value_t = 120.0)]
+    reach_mm: f64,
+}
+
+fn moved(name: &str) -> Result<Moved, String> {
+    [Moved::Shift, Moved::Pose, Moved::PoseAndZeros]
+        .into_iter()
+        .find(|m| m.name() == name)
+        .ok_or_else(|| format!("'{name}' is not one of shift, pose, pose-and-zeros"))
+}
+
+fn between(name: &str) -> Result<Between, String> {
+    match name {
+        "interpolated" => Ok(Between::Interpolated),
+        "nearest" => Ok(Between::Nearest),
+        _ => Err(format!("'{name}' is not one of interpolated, nearest")),
+    }
+}
+
 fn method(name: &str) -> Result<Method, String> {
     [Method::Gp, Method::Lattice, Method::Affine, Method::Rigid]
         .into_iter()
@@ -139,6 +202,8 @@ pub fn run(command: &Command) -> Result<Ended> {
         Command::Fit(args) => fit(args),
         Command::Apply(args) => apply(args),
         Command::Verify(args) => check(args),
+        Command::Realign(args) => realign(args),
+        Command::Correct(args) => correct(args),
     }
 }
 
@@ -270,4 +335,44 @@ fn check(args: &Verify) -> Result<Ended> {
     } else {
         Ended::NotGoodEnough
     })
+}
+
+fn realign(args: &Realign) -> Result<Ended> {
+    let map = Map::load(&args.map)?;
+    let pairs = read_pairs(&args.pairs)?;
+    let moved = args
+        .moved
+        .unwrap_or_else(|| Moved::for_pairs(&pairs));
+    let (realigned, told) = map.realign(&pairs, moved, &output::now_utc())?;
+    realigned.save(&args.out)?;
+    if args.json {
+        println!("{}", serde_json::to_string_pretty(&told)?);
+    } else {
+        println!("{told}\nmap written to {}", args.out.display());
+    }
+    let left_mm = told.after.total.p95_mm;
+    if left_mm > args.limit_mm {
+        eprintln!(
+            "{left_mm:.3} mm are left, more than {:.3}: visit more points, or calibrate anew",
+            args.limit_mm
+        );
+        return Ok(Ended::NotGoodEnough);
+    }
+    Ok(Ended::Good)
+}
+
+fn correct(args: &Correct) -> Result<Ended> {
+    let map = Map::load(&args.map)?;
+    let marks = read_marks(&args.marks)?;
+    map.correct(&marks, args.between, args.reach_mm)?.save(&args.out)?;
+    let n = marks.len() as f64;
+    let off_mm = marks.iter().map(|m| m.target.distance_mm(m.mark).powi(2)).sum::<f64>() / n;
+    println!(
+        "{} marks, off by {:.3} mm (rms): taken out within {:.0} mm of each; map written to {}",
+        marks.len(),
+        off_mm.sqrt(),
+        args.reach_mm,
+        args.out.display()
+    );
+    Ok(Ended::Good)
 }
