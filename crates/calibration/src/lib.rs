@@ -44,6 +44,7 @@
 //! ```
 
 mod correct;
+mod diagnose;
 mod gp;
 mod lattice;
 mod map;
@@ -55,6 +56,7 @@ mod rigid;
 mod ripple;
 
 pub use correct::{Between, CorrectError, Mark};
+pub use diagnose::{Diagnosis, Drift, Judged, WithFewer, diagnose, volume_covered};
 pub use lattice::Level;
 pub use map::{Hull, Identity, Map, MapError, MappedPoint, Method, Settings, camera_identity};
 pub use pair::{Pair, PairError, PairWriter, Query, read_marks, read_pairs, read_queries, write_pairs};

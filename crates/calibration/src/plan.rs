@@ -26,6 +26,14 @@ impl Volume {
         (0..3).all(|a| (self.min.to_array()[a]..=self.max.to_array()[a]).contains(&p.to_array()[a]))
     }
 
+    /// The place at these shares of the edges: 0 at the low corner, 1 at the high one.
+    pub fn at(&self, share: [f64; 3]) -> Point<Base> {
+        let extent = self.extent_mm();
+        let low = self.min.to_array();
+        let along = |a: usize| low[a] + share[a] * extent[a];
+        Point::new(along(0), along(1), along(2))
+    }
+
     /// Edge lengths, mm.
     pub fn extent_mm(&self) -> [f64; 3] {
         (self.max.vector() - self.min.vector()).into()

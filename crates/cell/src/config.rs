@@ -108,7 +108,7 @@ impl Default for Inspection {
             second_look_mm: 32.0,
             same_screw_mm: 4.0,
             stuck_cover_odds: 150.0,
-            doubtful_max: 3,
+            doubtful_max: 6,
             vision_s_per_mpx: 0.05,
         }
     }

@@ -141,11 +141,23 @@ pub fn is_doubtful(fits: f64, odds: f64) -> bool {
 
 /// Leaves of the doubtful heads the `most` likely ones; the others are for a person to look at. One missed screw holds a cover: that is
 /// evidence for the best few, not for every crossing of a grille.
-pub fn bound_doubtful(screws: &mut [vision::Screw], odds: f64, most: usize) {
-    let doubtful = screws.iter_mut().filter(|s| s.verdict == Verdict::Screw && is_doubtful(s.fits, odds));
-    let mut doubtful: Vec<_> = doubtful.collect();
-    doubtful.sort_by(|a, b| b.fits.total_cmp(&a.fits));
-    for screw in doubtful.into_iter().skip(most) {
+///
+/// # Arguments
+/// * `before` – finds of the same face when it was looked at without the odds: what was in doubt then and is now is likelier than
+///   what one of two pictures shows.
+pub fn bound_doubtful(screws: &mut [vision::Screw], odds: f64, most: usize, before: &[Found]) {
+    let seen_before = |screw: &vision::Screw| {
+        let near = |f: &&Found| (f.u_px - screw.pixel.u_px).hypot(f.v_px - screw.pixel.v_px) < screw.diameter_px;
+        let in_doubt = before.iter().filter(|f| f.verdict == Verdict::Review).filter(near);
+        in_doubt.map(|f| f.score).fold(0.0, f64::max)
+    };
+    let doubtful = screws
+        .iter_mut()
+        .filter(|s| s.verdict == Verdict::Screw && is_doubtful(s.fits, odds));
+    let alone = |s: &vision::Screw| s.fits / (s.fits + odds * (1.0 - s.fits));
+    let mut doubtful: Vec<(f64, &mut vision::Screw)> = doubtful.map(|s| (alone(s).max(seen_before(s)), s)).collect();
+    doubtful.sort_by(|a, b| b.0.total_cmp(&a.0));
+    for (_, screw) in doubtful.into_iter().skip(most) {
         screw.verdict = Verdict::Review;
     }
 }

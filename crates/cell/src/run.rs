@@ -468,7 +468,9 @@ impl Way<'_> {
         let shot = shoot(&self.runner.devices, None, config.inspection.depth_frames).await?;
         let odds = self.odds(purpose);
         let mut screws = self.runner.finder.find(&shot.frame, odds);
-        plan::bound_doubtful(&mut screws, odds, config.inspection.doubtful_max);
+        let before = self.record.faces.iter().rev().find(|f| f.face == *face);
+        let before = before.map_or(&[][..], |f| &f.found);
+        plan::bound_doubtful(&mut screws, odds, config.inspection.doubtful_max, before);
         self.budget(&shot);
         let heads: Vec<(Pixel, f64)> = screws.iter().map(|s| (s.pixel, s.diameter_px)).collect();
         let fit = FaceFit::around(&shot.frame, &heads, config.inspection.working_depth_mm);

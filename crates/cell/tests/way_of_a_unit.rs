@@ -401,9 +401,9 @@ fn on_a_stuck_cover_only_the_likeliest_doubtful_heads_are_tried() {
     assert!(matches!(record.outcome, Some(Outcome::Ng { .. })), "{:?}", record.outcome);
     let second = record.faces.iter().find(|f| f.purpose == Purpose::Missed);
     let second = second.expect("a second look at the stuck cover");
-    assert_eq!(second.attempts.len(), 3, "the others are left to a person");
+    assert_eq!(second.attempts.len(), 6, "the others are left to a person");
     let tried: Vec<f64> = second.attempts.iter().map(|a| second.found[a.found].score).collect();
-    assert!(tried.iter().all(|score| *score > 0.8965), "{tried:?}");
+    assert!(tried.iter().all(|score| *score > 0.8935), "{tried:?}");
     assert!(second.attempts.iter().all(|a| a.bursts.len() <= 2), "no search around what is doubtful");
 }
 

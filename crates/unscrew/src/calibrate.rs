@@ -1,9 +1,9 @@
-//! `unscrew calibrate`: plan, capture, fit, apply, verify, realign, correct.
+//! `unscrew calibrate`: plan, capture, fit, report, apply, verify, realign, correct.
 
-use crate::{Ended, output};
+use crate::{Ended, diagnosis, output};
 use anyhow::{Result, bail};
 use calibration::{
-    Between, Identity, Map, Method, Moved, PlanError, Settings, Target, Volume, lattice, read_marks, read_pairs,
+    Between, Identity, Map, Method, Moved, PlanError, Settings, Target, Volume, diagnose, lattice, read_marks, read_pairs,
     read_queries, scattered, verify,
 };
 use geometry::{Base, Point};
@@ -22,6 +22,9 @@ pub enum Command {
     /// Fit a map to pairs
     #[command(after_help = "Example: unscrew calibrate fit pairs_a.csv --out map_a.json")]
     Fit(Fit),
+    /// Is the map good, where is it not, and what limits it: a page with pictures, from the pairs
+    #[command(after_help = "Example: unscrew calibrate report pairs_a.csv --out report.html")]
+    Report(Report),
     /// Map observations to the robot's base
     #[command(after_help = "Example: unscrew calibrate apply --map map_a.json queries.csv")]
     Apply(Apply),
@@ -103,6 +106,21 @@ pub struct Fit {
     #[arg(long, default_value = "")]
     arm: String,
     /// As JSON
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(clap::Args)]
+pub struct Report {
+    /// Pairs (CSV)
+    pairs: PathBuf,
+    /// Page to write (HTML)
+    #[arg(long, value_name = "FILE")]
+    out: PathBuf,
+    /// Method of the map: gp, lattice, affine or rigid
+    #[arg(long, default_value = "gp", value_parser = method)]
+    method: Method,
+    /// The figures as JSON
     #[arg(long)]
     json: bool,
 }
@@ -200,6 +218,7 @@ pub fn run(command: &Command) -> Result<Ended> {
         Command::Plan(args) => plan(args),
         Command::Capture(args) => capture(args),
         Command::Fit(args) => fit(args),
+        Command::Report(args) => report(args),
         Command::Apply(args) => apply(args),
         Command::Verify(args) => check(args),
         Command::Realign(args) => realign(args),
@@ -266,6 +285,31 @@ fn fit(args: &Fit) -> Result<Ended> {
     } else {
         println!("{report}\nmap written to {}", args.out.display());
     }
+    Ok(Ended::Good)
+}
+
+fn report(args: &Report) -> Result<Ended> {
+    let pairs = read_pairs(&args.pairs)?;
+    let settings = Settings {
+        method: args.method,
+        date: output::now_utc(),
+        ..Settings::default()
+    };
+    let (map, found) = diagnose(&pairs, &settings)?;
+    let name = args.pairs.file_name().unwrap_or(args.pairs.as_os_str());
+    diagnosis::write(&map, &found, &name.to_string_lossy(), &args.out)?;
+    if args.json {
+        println!("{}", serde_json::to_string_pretty(&found)?);
+        return Ok(Ended::Good);
+    }
+    println!("{} pairs, each predicted by a map fitted without it:\n{}", found.held_out.n, found.held_out);
+    println!(
+        "  within the stated sigma: {:.0} % (68 % expected); within the 95 % interval: {:.0} %",
+        100.0 * found.coverage[0],
+        100.0 * found.coverage[1]
+    );
+    found.advice.iter().for_each(|word| println!("note: {word}"));
+    println!("report     {}", args.out.display());
     Ok(Ended::Good)
 }
 

@@ -7,6 +7,7 @@ mod annotations;
 mod calibrate;
 mod curve;
 mod detect;
+mod diagnosis;
 mod evaluate;
 mod output;
 mod report;

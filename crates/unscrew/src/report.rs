@@ -420,7 +420,7 @@ fn seconds(time_s: Option<f64>) -> String {
     time_s.map_or("–".into(), |t| format!("{t:.1} s"))
 }
 
-fn escape(text: &str) -> String {
+pub fn escape(text: &str) -> String {
     text.replace('&', "&amp;")
         .replace('<', "&lt;")
         .replace('>', "&gt;")
