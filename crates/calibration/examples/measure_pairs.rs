@@ -3,7 +3,11 @@
 //!
 //! `cargo run --release -p calibration --example measure_pairs -- PAIRS.csv QUERIES.csv`
 
-use calibration::{Hull, Map, Method, Settings, read_pairs, read_queries};
+use calibration::{Hull, Map, Method, Moved, Pair, Query, Settings, read_pairs, read_queries};
+use geometry::{Camera, Point};
+use nalgebra::{Isometry3, Point3, Vector3};
+use rand::{RngExt, SeedableRng};
+use rand_pcg::Pcg64Mcg;
 use std::{error::Error, path::Path, time::Instant};
 
 fn main() -> Result<(), Box<dyn Error>> {
@@ -35,6 +39,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         ("affine", Method::Affine, false),
         ("lattice, as published", Method::Lattice, true),
         ("lattice, robust", Method::Lattice, false),
+        ("tps", Method::Tps, false),
         ("gp", Method::Gp, false),
     ];
     for (name, method, as_published) in cases {
@@ -57,7 +62,7 @@ fn main() -> Result<(), Box<dyn Error>> {
             let mut off: Vec<f64> = mapped
                 .iter()
                 .filter(|(m, _)| !inside_only || m.hull == Hull::Inside)
-                .map(|(m, t)| m.base.distance_mm(geometry::Point::new(t[0], t[1], t[2])))
+                .map(|(m, t)| m.base.distance_mm(Point::new(t[0], t[1], t[2])))
                 .collect();
             off.sort_by(f64::total_cmp);
             off
@@ -79,9 +84,78 @@ fn main() -> Result<(), Box<dyn Error>> {
             over(&inside),
         );
         if name == "gp" {
-            println!("\n{report}");
+            println!("\n{report}\n");
+            with_noise(&map, &queries, &truth);
+            after_a_bump(&map, &queries, &truth)?;
         }
     }
+    Ok(())
+}
+
+fn gauss(rng: &mut Pcg64Mcg) -> f64 {
+    let (a, b): (f64, f64) = (rng.random_range(1e-12..1.0), rng.random_range(0.0..1.0));
+    (-2.0 * a.ln()).sqrt() * (std::f64::consts::TAU * b).cos()
+}
+
+/// What the camera would measure there: the map's own sigma, which holds its error too, is more than the noise alone.
+fn measured(map: &Map, at: Point<Camera>, share: f64, rng: &mut Pcg64Mcg) -> Point<Camera> {
+    let (sigma, c) = (map.apply(at), at.vector());
+    let ray = c.normalize();
+    let noise = Vector3::new(gauss(rng), gauss(rng), gauss(rng)) * sigma.sigma_lateral_mm;
+    let across = noise - ray * noise.dot(&ray);
+    Point::from_vector(c + (across + ray * (gauss(rng) * sigma.sigma_depth_mm)) * share)
+}
+
+fn tail(mut errors: Vec<f64>) -> String {
+    errors.sort_by(f64::total_cmp);
+    let at = |q: f64| errors[((errors.len() as f64 * q).ceil() as usize).clamp(1, errors.len()) - 1];
+    let rms = (errors.iter().map(|e| e * e).sum::<f64>() / errors.len() as f64).sqrt();
+    format!("rms {rms:.3}, p95 {:.3}, p99.9 {:.3} mm (n = {})", at(0.95), at(0.999), errors.len())
+}
+
+/// A point that is measured twice as long as the pairs were: twice the frames.
+fn with_noise(map: &Map, queries: &[Query], truth: &[[f64; 3]]) {
+    let rng = &mut Pcg64Mcg::seed_from_u64(1);
+    let errors = queries.iter().zip(truth).filter_map(|(q, [x, y, z])| {
+        let at = measured(map, q.camera?, 0.5f64.sqrt(), rng);
+        Some(map.apply(at).base.distance_mm(Point::new(*x, *y, *z)))
+    });
+    println!("gp, a point measured with twice the frames of the pairs: {}", tail(errors.collect()));
+}
+
+/// The camera is pushed by 1 mm and turned by 2 mrad; ten fresh points; the other queries, 20 times over.
+fn after_a_bump(map: &Map, queries: &[Query], truth: &[[f64; 3]]) -> Result<(), Box<dyn Error>> {
+    let rng = &mut Pcg64Mcg::seed_from_u64(2);
+    let (mut before, mut after) = (Vec::new(), Vec::new());
+    for trial in 0..20 {
+        let unit = |rng: &mut Pcg64Mcg| Vector3::new(gauss(rng), gauss(rng), gauss(rng)).normalize();
+        let bump = Isometry3::new(unit(rng), 2e-3 * unit(rng));
+        let moved = |at: Point<Camera>| Point::from_vector((bump * Point3::from(at.vector())).coords);
+        let is_fresh = |k: usize| k % 97 == 3 * trial % 97;
+        let rows = || queries.iter().zip(truth).enumerate().filter_map(|(k, (q, t))| Some((k, q.camera?, Point::new(t[0], t[1], t[2]))));
+        let fresh: Vec<Pair> = rows()
+            .filter(|(k, ..)| is_fresh(*k))
+            .take(10)
+            .map(|(k, camera, command)| Pair {
+                id: k as u64,
+                node: None,
+                t_s: 6.0 * k as f64,
+                command,
+                pixel: None,
+                depth_mm: None,
+                camera: Some(measured(map, moved(camera), 1.0, rng)),
+                joints_rad: None,
+                valid: true,
+            })
+            .collect();
+        let (realigned, _) = map.realign(&fresh, Moved::Pose, "")?;
+        for (_, camera, command) in rows().filter(|(k, ..)| !is_fresh(*k)) {
+            before.push(map.apply(moved(camera)).base.distance_mm(command));
+            after.push(realigned.apply(moved(camera)).base.distance_mm(command));
+        }
+    }
+    println!("gp, after a bump of 1 mm and 2 mrad: {}", tail(before));
+    println!("gp, realigned with 10 points:        {}", tail(after));
     Ok(())
 }
 

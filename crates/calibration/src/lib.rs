@@ -6,7 +6,7 @@
 //! calibrated volume. [`verify`] tells from fresh pairs whether a map still holds; [`Map::realign`] makes it true again after a bump or a
 //! crash, and [`Map::correct`] takes out what a needle shows to be left. It uses only `geometry`.
 //!
-//! Two methods stand side by side. `gp`, the default, is a Gaussian process of what a rigid motion leaves, across and along the
+//! Methods stand side by side. `gp`, the default, is a Gaussian process of what a rigid motion leaves, across and along the
 //! viewing ray, with waves of the joint angles for the ripple of the gears: 100 points do. `lattice` is the paper's Algorithm 2
 //! (global linear map, 27 neighbours, second-order interpolation) with what real data needs: outliers are rejected by robust local
 //! prediction, and thin neighbourhoods fall back to wider ones, to first order, and at last to the global map.
@@ -50,17 +50,20 @@ mod lattice;
 mod map;
 mod pair;
 mod plan;
+mod pose;
 mod realign;
 mod report;
 mod rigid;
 mod ripple;
+mod tps;
 
 pub use correct::{Between, CorrectError, Mark};
 pub use diagnose::{Diagnosis, Drift, Judged, WithFewer, diagnose, volume_covered};
 pub use lattice::Level;
-pub use map::{Hull, Identity, Map, MapError, MappedPoint, Method, Settings, camera_identity};
+pub use map::{Check, Hull, Identity, Map, MapError, MappedPoint, Method, Settings, camera_identity};
 pub use pair::{Pair, PairError, PairWriter, Query, read_marks, read_pairs, read_queries, write_pairs};
 pub use plan::{PlanError, Target, Volume, lattice, node_counts, scattered};
+pub use pose::{HandEye, PoseError};
 pub use realign::{Moved, RealignError, Realignment};
-pub use report::{Figures, FitReport, Rejected, Spread, Verification, verify};
+pub use report::{Figures, FitReport, Rejected, Spread, Verification, rigid_figures, verify};
 pub use rigid::FitError;

@@ -8,6 +8,7 @@ use crate::{
     pair, realign,
     ripple::Ripple,
     rigid::{self, Points, quantile},
+    tps::{self, Spline},
 };
 use geometry::{Base, Camera, CameraModel, Point, Transform};
 use nalgebra::Vector3;
@@ -24,6 +25,8 @@ pub enum Method {
     Affine,
     /// The paper's Algorithm 2: global map, then second order among the 27 points around.
     Lattice,
+    /// A thin-plate spline of what the rigid motion leaves, smoothed by the least left-out error.
+    Tps,
     /// A Gaussian process of what the rigid motion leaves, and the ripple of the gears where the pairs have joint angles of a
     /// GP25: 100 points do as well as thousands do for the others.
     #[default]
@@ -37,6 +40,7 @@ impl Method {
             Self::Rigid => "rigid",
             Self::Affine => "affine",
             Self::Lattice => "lattice",
+            Self::Tps => "tps",
             Self::Gp => "gp",
         }
     }
@@ -46,7 +50,7 @@ impl Method {
         match self {
             Self::Rigid => 5,
             Self::Affine => 8,
-            Self::Lattice | Self::Gp => 20,
+            Self::Lattice | Self::Tps | Self::Gp => 20,
         }
     }
 }
@@ -105,6 +109,17 @@ pub struct MappedPoint {
     pub hull: Hull,
 }
 
+/// What the last check with fresh pairs said.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Check {
+    /// When, RFC 3339.
+    pub date: String,
+    /// True if the map passed.
+    pub passed: bool,
+    /// 95 % of the errors were within this, mm.
+    pub p95_mm: f64,
+}
+
 /// Why a map file cannot be used, and what to do about it.
 #[derive(Debug, thiserror::Error)]
 pub enum MapError {
@@ -145,6 +160,18 @@ pub enum MapError {
         /// The camera of the cell.
         wanted: String,
     },
+    /// A map that failed its last check.
+    #[error(
+        "{path} failed its check of {date} (95 % within {p95_mm:.3} mm): realign it with `unscrew calibrate realign`, or calibrate anew"
+    )]
+    FailedCheck {
+        /// The file.
+        path: PathBuf,
+        /// When it was checked.
+        date: String,
+        /// What the check gave, mm.
+        p95_mm: f64,
+    },
     /// A map that was fitted with another arm.
     #[error("{path} was fitted for arm '{found}', not for '{wanted}'; calibrate this arm")]
     WrongArm {
@@ -171,6 +198,7 @@ pub struct Map {
     file: MapFile,
     model: Model,
     gp: Option<Gp>,
+    spline: Option<Spline>,
 }
 
 /// What is written: the points that the map rests on; everything else follows from them.
@@ -192,6 +220,9 @@ struct MapFile {
     /// What has moved since.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     realigned: Option<realign::Layer>,
+    /// What the last check said.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    checked: Option<Check>,
     /// What a needle showed to be left.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     correction: Option<correct::Layer>,
@@ -252,16 +283,25 @@ impl Map {
         let model = Model::bake(shape(settings), grid, &camera, &command);
 
         let ray = |i: usize| model.ray(camera[i]);
+        let bent = match method {
+            Method::Tps => Some(spline(&camera, &command).ok_or(FitError::TooFew {
+                have: used.len(),
+                need: method.fewest_pairs(),
+                method: method.name(),
+            })?),
+            _ => None,
+        };
         let held: Vec<Estimate> = model.leave_one_out(&camera, &command);
-        let errors: Vec<_> = match &fitted {
-            Some(fitted) => fitted
+        let errors: Vec<_> = match (&fitted, &bent) {
+            (Some(fitted), _) => fitted
                 .choice
                 .points
                 .iter()
                 .zip(&fitted.left_out)
                 .map(|(&i, e)| (*e, ray(i)))
                 .collect(),
-            None => (0..).zip(&held).map(|(i, e)| (e.base - command[i], ray(i))).collect(),
+            (None, Some(bent)) => bent.0.iter().zip(&bent.1.left_out).map(|(&i, e)| (*e, ray(i))).collect(),
+            (None, None) => (0..).zip(&held).map(|(i, e)| (e.base - command[i], ray(i))).collect(),
         };
         let rigid_errors: Vec<_> = (0..used.len())
             .map(|i| {
@@ -325,15 +365,27 @@ impl Map {
             rejected: report.rejected.len(),
             base_from_camera: Transform::from_isometry(model.motion),
             volume: Volume::between(Point::from_vector(low), Point::from_vector(high)),
-            scales_mm: scales(&model, &camera, &command, &held),
+            scales_mm: match &bent {
+                Some(_) => [measured(&errors); 4],
+                None => scales(&model, &camera, &command, &held),
+            },
             gp: fitted.as_ref().map(|f| f.choice.clone()),
             realigned: None,
+            checked: None,
             correction: None,
             grid: model.grid.clone(),
             points: used.iter().zip(camera.iter().zip(&command)).map(support).collect(),
         };
-        let gp = fitted.map(|f| f.gp);
-        Ok((Self { file, model, gp }, report))
+        let (gp, spline) = (fitted.map(|f| f.gp), bent.map(|b| b.1.spline));
+        Ok((
+            Self {
+                file,
+                model,
+                gp,
+                spline,
+            },
+            report,
+        ))
     }
 
     /// Where a camera point is in the robot's base frame.
@@ -386,8 +438,9 @@ impl Map {
                 .sum();
             variance.sqrt() * beyond
         };
+        let base = self.spline.as_ref().map_or(e.base, |spline| spline.at(camera.vector()));
         MappedPoint {
-            base: Point::from_vector(e.base),
+            base: Point::from_vector(base),
             sigma_lateral_mm: sigma(0),
             sigma_depth_mm: sigma(1),
             hull: hull(&e, e.variance.iter().sum(), 1.2),
@@ -453,13 +506,25 @@ impl Map {
             }
             None => None,
         };
-        Ok(Self { file, model, gp })
+        let spline = match file.settings.method {
+            Method::Tps => {
+                let again = spline(&camera, &command);
+                Some(again.ok_or_else(|| bad("its points do not determine it".into()))?.1.spline)
+            }
+            _ => None,
+        };
+        Ok(Self {
+            file,
+            model,
+            gp,
+            spline,
+        })
     }
 
     /// Reads a map and makes sure that it belongs to this arm and this camera.
     ///
     /// # Errors
-    /// As for [`load`](Self::load), [`MapError::WrongCamera`], [`MapError::WrongArm`].
+    /// As for [`load`](Self::load), [`MapError::WrongCamera`], [`MapError::WrongArm`], [`MapError::FailedCheck`].
     pub fn load_for(path: &Path, identity: &Identity) -> Result<Self, MapError> {
         let map = Self::load(path)?;
         let Identity { arm, camera } = map.identity();
@@ -477,12 +542,20 @@ impl Map {
                 wanted: identity.arm.clone(),
             });
         }
+        if let Some(check) = map.file.checked.as_ref().filter(|c| !c.passed) {
+            return Err(MapError::FailedCheck {
+                path: path.into(),
+                date: check.date.clone(),
+                p95_mm: check.p95_mm,
+            });
+        }
         Ok(map)
     }
 
     pub(crate) fn with_layer(&self, layer: realign::Layer) -> Self {
         let mut map = self.clone();
         (map.file.version, map.file.realigned) = (VERSION, Some(layer));
+        map.file.checked = None; // of how it was before
         map
     }
 
@@ -502,6 +575,24 @@ impl Map {
     /// What the last realignment found.
     pub fn realigned(&self) -> Option<&realign::Realignment> {
         self.file.realigned.as_ref().map(|layer| &layer.told)
+    }
+
+    /// The map with what a check said of it.
+    pub fn with_check(&self, check: Check) -> Self {
+        let mut map = self.clone();
+        (map.file.version, map.file.checked) = (VERSION, Some(check));
+        map
+    }
+
+    /// When it was last known to be true, RFC 3339: fitted, realigned or checked.
+    pub fn known_good_on(&self) -> &str {
+        let checked = self.file.checked.as_ref().filter(|c| c.passed).map(|c| c.date.as_str());
+        let realigned = self.realigned().map(|r| r.date.as_str());
+        [checked, realigned, Some(self.file.settings.date.as_str())]
+            .into_iter()
+            .flatten()
+            .max()
+            .unwrap_or_default()
     }
 
     /// The arm's lengths and tool, where ripple was found.
@@ -578,15 +669,7 @@ fn gaussian(pairs: &[Pair], points: &Points, keep: &mut [bool]) -> Result<gp::Fi
     if used.len() < method.fewest_pairs() {
         return Err(too_few);
     }
-    if used.len() > gp::MOST_POINTS {
-        // spread over a file that may be in the order of a lattice
-        used.sort_by(|a, b| {
-            let place = |i: usize| (i as f64 * 0.618_033_988_749_895).fract();
-            place(*a).total_cmp(&place(*b))
-        });
-        used.truncate(gp::MOST_POINTS);
-        used.sort_unstable();
-    }
+    used = spread(used.len(), gp::MOST_POINTS).into_iter().map(|k| used[k]).collect();
     let of = |all: &[Vector3<f64>]| -> Vec<Vector3<f64>> { used.iter().map(|&i| all[i]).collect() };
     let joints: Option<Vec<_>> = used.iter().map(|&i| first_joints(&pairs[points.index[i]])).collect();
     let mut fitted = gp::fit(&of(&points.camera), &of(&points.command), joints.as_deref()).ok_or(too_few)?;
@@ -602,6 +685,37 @@ fn gaussian(pairs: &[Pair], points: &Points, keep: &mut [bool]) -> Result<gp::Fi
         place += usize::from(kept);
     }
     Ok(fitted)
+}
+
+/// The spline over the believed points, or over as many of them as it needs, and which these are.
+fn spline(camera: &[Vector3<f64>], command: &[Vector3<f64>]) -> Option<(Vec<usize>, tps::Fitted)> {
+    let picked = spread(camera.len(), gp::MOST_POINTS);
+    let of = |all: &[Vector3<f64>]| -> Vec<Vector3<f64>> { picked.iter().map(|&i| all[i]).collect() };
+    let fitted = Spline::fit(&of(camera), &of(command))?;
+    Some((picked, fitted))
+}
+
+/// At most `most` of `n` places, spread also where they are in the order of a lattice.
+fn spread(n: usize, most: usize) -> Vec<usize> {
+    let mut places: Vec<usize> = (0..n).collect();
+    if n > most {
+        let key = |i: usize| (i as f64 * 0.618_033_988_749_895).fract();
+        places.sort_by(|&a, &b| key(a).total_cmp(&key(b)));
+        places.truncate(most);
+        places.sort_unstable();
+    }
+    places
+}
+
+/// Sigma of one measurement and the map from left-out errors: across the ray, along each axis, and along it.
+fn measured(errors: &[(Vector3<f64>, Vector3<f64>)]) -> [f64; 2] {
+    let parts: Vec<_> = errors.iter().map(|(error, ray)| split(*error, *ray)).collect();
+    let at = |values: Vec<f64>| quantile(values, 0.6827);
+    // the length of two components is within 1.515 sigma in 68.27 % of cases
+    [
+        at(parts.iter().map(|p| p.0).collect()) / 1.5151,
+        at(parts.iter().map(|p| p.1.abs()).collect()),
+    ]
 }
 
 fn shape(settings: &Settings) -> Shape {

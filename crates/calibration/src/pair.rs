@@ -132,6 +132,14 @@ pub enum PairError {
         /// Why it cannot be used and what to do.
         problem: &'static str,
     },
+    /// Not a pose.
+    #[error("{path}: {reason}")]
+    Pose {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        reason: crate::PoseError,
+    },
     /// Two rows with the same id.
     #[error("{path} line {line}: id {id} stands already in line {first}; a visit may be in the file once")]
     DuplicateId {

@@ -1,6 +1,7 @@
 //! Is the map good, in millimetres, and where is it not?
 
 use crate::{Hull, Level, Map, Pair, rigid::quantile};
+use geometry::{Base, Camera, Transform};
 use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 use std::fmt;
@@ -208,6 +209,8 @@ pub struct Verification {
     pub edge: usize,
     /// Points outside the calibrated volume.
     pub outside: usize,
+    /// Probability that a map which is as good as its sigma says fails at these points all the same.
+    pub false_alarm: f64,
     /// Visits without a marker.
     pub n_invalid: usize,
     /// Errors of the map at the fresh pairs (noise of the measurement included).
@@ -225,7 +228,7 @@ pub struct Verification {
 /// Checks a map against pairs that it was not fitted to: passes if 95 % of the 3D errors are at most `limit_mm` and no point is outside.
 pub fn verify(map: &Map, pairs: &[Pair], limit_mm: f64) -> Verification {
     let mut hulls = [0usize; 3];
-    let (mut errors, mut worst) = (Vec::new(), Vec::new());
+    let (mut errors, mut worst, mut beyond) = (Vec::new(), Vec::new(), Vec::new());
     let (mut one, mut two) = (0usize, 0usize);
     for pair in pairs.iter().filter(|p| p.valid) {
         let Some(camera) = pair.camera else { continue };
@@ -241,6 +244,7 @@ pub fn verify(map: &Map, pairs: &[Pair], limit_mm: f64) -> Verification {
         one += within(1.5151, 1.0);
         two += within(2.4477, 1.96);
         hulls[mapped.hull as usize] += 1;
+        beyond.push(beyond_limit(mapped.sigma_lateral_mm, mapped.sigma_depth_mm, limit_mm));
         errors.push((error, ray));
         worst.push(Rejected {
             id: pair.id,
@@ -260,6 +264,7 @@ pub fn verify(map: &Map, pairs: &[Pair], limit_mm: f64) -> Verification {
         inside: hulls[Hull::Inside as usize],
         edge: hulls[Hull::Edge as usize],
         outside,
+        false_alarm: more_than_a_twentieth(&beyond),
         n_invalid: pairs.iter().filter(|p| !p.valid).count(),
         figures,
         within_one_sigma: one as f64 / (2.0 * n),
@@ -267,6 +272,54 @@ pub fn verify(map: &Map, pairs: &[Pair], limit_mm: f64) -> Verification {
         mean_error_mm: (errors.iter().map(|(e, _)| e).sum::<Vector3<f64>>() / n).into(),
         worst,
     }
+}
+
+/// Errors of one rigid motion, such as another tool's hand-eye calibration, at pairs.
+pub fn rigid_figures(base_from_camera: &Transform<Base, Camera>, pairs: &[Pair]) -> Figures {
+    let seen = pairs.iter().filter(|p| p.valid).filter_map(|p| Some((p.command, p.camera?)));
+    let rotation = base_from_camera.isometry().rotation;
+    let errors: Vec<_> = seen
+        .map(|(command, camera)| {
+            let error = (*base_from_camera * camera).vector() - command.vector();
+            (error, rotation * camera.vector().normalize())
+        })
+        .collect();
+    Figures::of(&errors)
+}
+
+/// Probability that a 3D error with these sigmas (across the ray, along each axis; along it) is larger than a limit.
+fn beyond_limit(lateral_mm: f64, depth_mm: f64, limit_mm: f64) -> f64 {
+    const STEPS: usize = 400;
+    const MOST: f64 = 6.0;
+    let step = MOST / STEPS as f64;
+    let at = |k: usize| {
+        let z = (k as f64 + 0.5) * step;
+        let room = limit_mm.powi(2) - (depth_mm * z).powi(2);
+        // across the ray: the length of two normal components
+        let across = if room > 0.0 {
+            (-room / (2.0 * lateral_mm.max(1e-9).powi(2))).exp()
+        } else {
+            1.0
+        };
+        (-0.5 * z * z).exp() * across
+    };
+    (0..STEPS).map(at).sum::<f64>() * step * (2.0 / std::f64::consts::PI).sqrt()
+}
+
+/// Probability that so many of the errors are beyond the limit that less than 95 % are within.
+fn more_than_a_twentieth(beyond: &[f64]) -> f64 {
+    let n = beyond.len();
+    let allowed = n - (0.95 * n as f64).ceil() as usize;
+    // distribution of the number beyond: one error after the other
+    let mut count = vec![0.0; n + 1];
+    count[0] = 1.0;
+    for (k, p) in beyond.iter().enumerate() {
+        for m in (0..=k).rev() {
+            count[m + 1] += count[m] * p;
+            count[m] *= 1.0 - p;
+        }
+    }
+    count[allowed + 1..].iter().sum()
 }
 
 impl fmt::Display for Verification {
@@ -293,6 +346,11 @@ impl fmt::Display for Verification {
             "{} points ({inside} inside, {edge} edge, {outside} outside), {n_invalid} without marker",
             figures.n
         )?;
+        writeln!(
+            f,
+            "a map as good as its sigma would fail here in {:.1} % of cases",
+            100.0 * self.false_alarm
+        )?;
         writeln!(f, "{figures}")?;
         let [x, y, z] = self.mean_error_mm;
         writeln!(f, "  mean error: {x:+.3}, {y:+.3}, {z:+.3} mm")?;
@@ -302,5 +360,23 @@ impl fmt::Display for Verification {
             100.0 * self.within_one_sigma,
             100.0 * self.within_two_sigma
         )
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn false_alarms_come_as_often_as_stated() {
+        // 20 points; one may be beyond
+        let all_alike = [0.05; 20];
+        let expected = 1.0 - 0.95f64.powi(20) - 20.0 * 0.05 * 0.95f64.powi(19);
+        assert!((more_than_a_twentieth(&all_alike) - expected).abs() < 1e-12);
+        assert_eq!(more_than_a_twentieth(&[]), 0.0);
+        // Maxwell: 3D error of equal sigmas, 2.7955 sigma holds 95 %
+        assert!((beyond_limit(0.1, 0.1, 0.279_55) - 0.05).abs() < 1e-4);
+        // depth alone: a normal distribution
+        assert!((beyond_limit(1e-6, 0.1, 0.196) - 0.05).abs() < 1e-3);
     }
 }

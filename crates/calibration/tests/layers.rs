@@ -3,7 +3,7 @@
 mod arm;
 
 use arm::{World, gp, pairs};
-use calibration::{Between, CorrectError, Hull, Map, Mark, Moved, RealignError, verify};
+use calibration::{Between, Check, CorrectError, Hull, Map, MapError, Mark, Moved, RealignError, verify};
 use geometry::Point;
 use nalgebra::{Isometry3, Vector3};
 
@@ -173,5 +173,32 @@ fn needle_marks_are_taken_out_where_they_are_and_fade_beyond() -> Result<(), Box
     assert_eq!(map.correct(&[], Between::Nearest, 100.0).err(), Some(CorrectError::None));
     let gross = map.correct(&[mark(1, target, 20.0 * off)], Between::Nearest, 100.0);
     assert!(matches!(gross.err(), Some(CorrectError::TooFar { id: 1, .. })));
+    Ok(())
+}
+
+#[test]
+fn a_cell_refuses_a_map_that_failed_its_check() -> Result<(), Box<dyn std::error::Error>> {
+    let (map, world) = (fitted(8), bumped());
+    let folder = tempfile::tempdir()?;
+    let path = folder.path().join("map.json");
+    let check = |map: &Map, world: &World, date: &str| {
+        let told = verify(map, &world.pairs(60, 20), 0.5);
+        map.with_check(Check {
+            date: date.into(),
+            passed: told.passed,
+            p95_mm: told.figures.total.p95_mm,
+        })
+    };
+    let identity = map.identity().clone();
+    check(&map, &World::untouched(), "2026-02-01T00:00:00Z").save(&path)?;
+    assert_eq!(Map::load_for(&path, &identity)?.known_good_on(), "2026-02-01T00:00:00Z");
+    let failed = check(&map, &world, "2026-03-01T00:00:00Z");
+    failed.save(&path)?;
+    let refused = Map::load_for(&path, &identity);
+    assert!(matches!(refused, Err(MapError::FailedCheck { .. })), "{refused:?}");
+    // realigned, it is as good as new
+    let (again, _) = failed.realign(&world.pairs(61, 12), Moved::Pose, "2026-03-02T00:00:00Z")?;
+    again.save(&path)?;
+    assert_eq!(Map::load_for(&path, &identity)?.known_good_on(), "2026-03-02T00:00:00Z");
     Ok(())
 }

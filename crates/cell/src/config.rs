@@ -160,6 +160,8 @@ pub struct Approach {
     /// The sheet around a screw is followed instead of the whole face if it leans further from it than this, rad: below, the
     /// face's plane is the better measurement.
     pub local_normal_from_rad: f64,
+    /// Age from which a map is not trusted any more, days since it was fitted, realigned or last passed a check.
+    pub map_age_max_days: f64,
 }
 
 impl Default for Approach {
@@ -169,6 +171,7 @@ impl Default for Approach {
             approach_mm_s: 150.0,
             retract_mm_s: 400.0,
             local_normal_from_rad: 3f64.to_radians(),
+            map_age_max_days: 30.0,
         }
     }
 }

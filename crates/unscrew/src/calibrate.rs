@@ -1,10 +1,10 @@
-//! `unscrew calibrate`: plan, capture, fit, report, apply, verify, realign, correct.
+//! `unscrew calibrate`: plan, capture, fit, report, apply, verify, export, realign, correct.
 
 use crate::{Ended, diagnosis, output};
 use anyhow::{Result, bail};
 use calibration::{
-    Between, Identity, Map, Method, Moved, PlanError, Settings, Target, Volume, diagnose, lattice, read_marks, read_pairs,
-    read_queries, scattered, verify,
+    Between, Check, HandEye, Identity, Map, Method, Moved, PlanError, Settings, Target, Volume, diagnose, lattice, read_marks, read_pairs,
+    read_queries, rigid_figures, scattered, verify,
 };
 use geometry::{Base, Point};
 use serde::Serialize;
@@ -31,6 +31,9 @@ pub enum Command {
     /// Check a map against fresh pairs
     #[command(after_help = "Example: unscrew calibrate verify --map map_a.json fresh_pairs.csv --limit-mm 0.35")]
     Verify(Verify),
+    /// Print a map's rigid part as other tools want it: easy_handeye's YAML or a ROS 2 command
+    #[command(after_help = "Example: unscrew calibrate export --map map_a.json > handeye.yaml")]
+    Export(Export),
     /// Make a map true again after a bump or a crash, from 5 to 20 fresh pairs
     #[command(after_help = "Example: unscrew calibrate realign --map map_a.json fresh_pairs.csv --out map_a.json")]
     Realign(Realign),
@@ -96,7 +99,7 @@ pub struct Fit {
     /// Map file to write
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
-    /// gp (Gaussian process and ripple of the gears), lattice (the paper's, with rejection of outliers), affine or rigid
+    /// gp (Gaussian process and ripple of the gears), lattice (the paper's, with rejection of outliers), tps (thin-plate spline), affine or rigid
     #[arg(long, default_value = "gp", value_parser = method)]
     method: Method,
     /// With --method lattice exactly as published: no rejection, no fallback
@@ -117,7 +120,7 @@ pub struct Report {
     /// Page to write (HTML)
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
-    /// Method of the map: gp, lattice, affine or rigid
+    /// Method of the map: gp, lattice, tps, affine or rigid
     #[arg(long, default_value = "gp", value_parser = method)]
     method: Method,
     /// The figures as JSON
@@ -140,8 +143,14 @@ pub struct Apply {
 #[derive(clap::Args)]
 pub struct Verify {
     /// Map file
-    #[arg(long, value_name = "FILE")]
-    map: PathBuf,
+    #[arg(long, value_name = "FILE", required_unless_present = "pose")]
+    map: Option<PathBuf>,
+    /// Another tool's hand-eye calibration instead (easy_handeye's YAML, eye_on_base), to compare with
+    #[arg(long, value_name = "FILE", conflicts_with = "map")]
+    pose: Option<PathBuf>,
+    /// Write the outcome into the map file: a cell refuses a map that failed, or that was not checked for long
+    #[arg(long, requires = "map")]
+    record: bool,
     /// Pairs that the map was not fitted to (CSV)
     pairs: PathBuf,
     /// Passes if 95 % of the 3D errors are at most this, mm
@@ -150,6 +159,30 @@ pub struct Verify {
     /// As JSON
     #[arg(long)]
     json: bool,
+}
+
+#[derive(clap::Args)]
+pub struct Export {
+    /// Map file
+    #[arg(long, value_name = "FILE")]
+    map: PathBuf,
+    /// What it is for
+    #[arg(long, value_enum, default_value_t = ExportAs::EasyHandeye)]
+    format: ExportAs,
+    /// Name of the robot's frame
+    #[arg(long, default_value = "base")]
+    base_frame: String,
+    /// Name of the camera's frame
+    #[arg(long, default_value = "camera_optical_frame")]
+    camera_frame: String,
+}
+
+#[derive(Clone, Copy, Debug, clap::ValueEnum)]
+enum ExportAs {
+    /// YAML as easy_handeye keeps it (eye_on_base)
+    EasyHandeye,
+    /// Command that publishes the transform in ROS 2
+    Ros,
 }
 
 #[derive(clap::Args)]
@@ -207,10 +240,10 @@ fn between(name: &str) -> Result<Between, String> {
 }
 
 fn method(name: &str) -> Result<Method, String> {
-    [Method::Gp, Method::Lattice, Method::Affine, Method::Rigid]
+    [Method::Gp, Method::Lattice, Method::Tps, Method::Affine, Method::Rigid]
         .into_iter()
         .find(|m| m.name() == name)
-        .ok_or_else(|| format!("'{name}' is not one of gp, lattice, affine, rigid"))
+        .ok_or_else(|| format!("'{name}' is not one of gp, lattice, tps, affine, rigid"))
 }
 
 pub fn run(command: &Command) -> Result<Ended> {
@@ -221,6 +254,7 @@ pub fn run(command: &Command) -> Result<Ended> {
         Command::Report(args) => report(args),
         Command::Apply(args) => apply(args),
         Command::Verify(args) => check(args),
+        Command::Export(args) => export(args),
         Command::Realign(args) => realign(args),
         Command::Correct(args) => correct(args),
     }
@@ -367,8 +401,29 @@ fn check(args: &Verify) -> Result<Ended> {
     if args.limit_mm.is_nan() || args.limit_mm <= 0.0 {
         bail!("--limit-mm {} is not a positive number of millimetres", args.limit_mm);
     }
-    let map = Map::load(&args.map)?;
-    let verification = verify(&map, &read_pairs(&args.pairs)?, args.limit_mm);
+    let pairs = read_pairs(&args.pairs)?;
+    let Some(path) = &args.map else {
+        let pose = args.pose.as_deref().map(HandEye::read).transpose()?;
+        let Some(pose) = pose else { bail!("give a map by --map, or a pose by --pose") };
+        let figures = rigid_figures(&pose.base_from_camera, &pairs);
+        if args.json {
+            println!("{}", serde_json::to_string_pretty(&figures)?);
+        } else {
+            println!("{} points under this pose alone:\n{figures}", figures.n);
+        }
+        let good = figures.n > 0 && figures.total.p95_mm <= args.limit_mm;
+        return Ok(if good { Ended::Good } else { Ended::NotGoodEnough });
+    };
+    let map = Map::load(path)?;
+    let verification = verify(&map, &pairs, args.limit_mm);
+    if args.record {
+        let check = Check {
+            date: output::now_utc(),
+            passed: verification.passed,
+            p95_mm: verification.figures.total.p95_mm,
+        };
+        map.with_check(check).save(path)?;
+    }
     if args.json {
         println!("{}", serde_json::to_string_pretty(&verification)?);
     } else {
@@ -379,6 +434,19 @@ fn check(args: &Verify) -> Result<Ended> {
     } else {
         Ended::NotGoodEnough
     })
+}
+
+fn export(args: &Export) -> Result<Ended> {
+    let pose = HandEye {
+        base_frame: args.base_frame.clone(),
+        camera_frame: args.camera_frame.clone(),
+        base_from_camera: Map::load(&args.map)?.base_from_camera(),
+    };
+    match args.format {
+        ExportAs::EasyHandeye => print!("{}", pose.to_yaml()),
+        ExportAs::Ros => println!("{}", pose.to_ros()),
+    }
+    Ok(Ended::Good)
 }
 
 fn realign(args: &Realign) -> Result<Ended> {

@@ -54,6 +54,12 @@ pub fn stop_on_ctrl_c() -> Arc<AtomicBool> {
     stop
 }
 
+/// Days since a date and time in RFC 3339; `None` if it is none.
+pub fn age_days(date: &str) -> Option<f64> {
+    let then: jiff::Timestamp = date.parse().ok()?;
+    Some(jiff::Timestamp::now().duration_since(then).as_secs_f64() / 86_400.0)
+}
+
 /// The date and time now, UTC, for map and model files.
 pub fn now_utc() -> String {
     jiff::Timestamp::now().strftime("%Y-%m-%dT%H:%M:%SZ").to_string()

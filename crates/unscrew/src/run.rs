@@ -94,7 +94,7 @@ pub fn run(args: &Args) -> Result<Ended> {
         .build()
         .context("cannot start the event loop")?;
     let stop = output::stop_on_ctrl_c();
-    let (maps, calibration) = runtime.block_on(calibrated(&settings, &simulated.devices, args, &stop))?;
+    let (maps, calibration) = runtime.block_on(calibrated(&settings, &simulated.devices, &config, args, &stop))?;
     let provenance = format!(
         "{} units of seed {}, cell seed {}, model {}, unscrew {}.",
         args.units,
@@ -164,6 +164,7 @@ pub fn run(args: &Args) -> Result<Ended> {
 async fn calibrated(
     settings: &SimSettings,
     real: &Devices,
+    config: &CellConfig,
     args: &Args,
     stop: &AtomicBool,
 ) -> Result<(Vec<Map>, String)> {
@@ -179,6 +180,15 @@ async fn calibrated(
         let path = folder.join(format!("map_{name}.json"));
         if path.exists() {
             let map = Map::load_for(&path, &identity)?;
+            let (age_days, most) = (output::age_days(map.known_good_on()), config.approach.map_age_max_days);
+            if age_days.is_none_or(|days| days > most) {
+                bail!(
+                    "{} is of {}, more than {most} days ago: check it with `unscrew calibrate verify --record`, realign it, or delete it \
+                     and its pairs to calibrate anew",
+                    path.display(),
+                    map.known_good_on()
+                );
+            }
             notes.push(format!(
                 "{name}: map of {}, {} pairs",
                 map.settings().date,
