@@ -110,7 +110,12 @@ fn tail(mut errors: Vec<f64>) -> String {
     errors.sort_by(f64::total_cmp);
     let at = |q: f64| errors[((errors.len() as f64 * q).ceil() as usize).clamp(1, errors.len()) - 1];
     let rms = (errors.iter().map(|e| e * e).sum::<f64>() / errors.len() as f64).sqrt();
-    format!("rms {rms:.3}, p95 {:.3}, p99.9 {:.3} mm (n = {})", at(0.95), at(0.999), errors.len())
+    format!(
+        "rms {rms:.3}, p95 {:.3}, p99.9 {:.3} mm (n = {})",
+        at(0.95),
+        at(0.999),
+        errors.len()
+    )
 }
 
 /// A point that is measured twice as long as the pairs were: twice the frames.
@@ -120,7 +125,10 @@ fn with_noise(map: &Map, queries: &[Query], truth: &[[f64; 3]]) {
         let at = measured(map, q.camera?, 0.5f64.sqrt(), rng);
         Some(map.apply(at).base.distance_mm(Point::new(*x, *y, *z)))
     });
-    println!("gp, a point measured with twice the frames of the pairs: {}", tail(errors.collect()));
+    println!(
+        "gp, a point measured with twice the frames of the pairs: {}",
+        tail(errors.collect())
+    );
 }
 
 /// The camera is pushed by 1 mm and turned by 2 mrad; ten fresh points; the other queries, 20 times over.
@@ -132,7 +140,13 @@ fn after_a_bump(map: &Map, queries: &[Query], truth: &[[f64; 3]]) -> Result<(), 
         let bump = Isometry3::new(unit(rng), 2e-3 * unit(rng));
         let moved = |at: Point<Camera>| Point::from_vector((bump * Point3::from(at.vector())).coords);
         let is_fresh = |k: usize| k % 97 == 3 * trial % 97;
-        let rows = || queries.iter().zip(truth).enumerate().filter_map(|(k, (q, t))| Some((k, q.camera?, Point::new(t[0], t[1], t[2]))));
+        let rows = || {
+            queries
+                .iter()
+                .zip(truth)
+                .enumerate()
+                .filter_map(|(k, (q, t))| Some((k, q.camera?, Point::new(t[0], t[1], t[2]))))
+        };
         let fresh: Vec<Pair> = rows()
             .filter(|(k, ..)| is_fresh(*k))
             .take(10)

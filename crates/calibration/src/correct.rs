@@ -34,7 +34,9 @@ pub enum CorrectError {
     #[error("no marks: give at least one target with where the needle touched")]
     None,
     /// A mark that is no mark of its target.
-    #[error("mark {id} is {off_mm:.1} mm from its target; a correction is for what is left after calibrating, at most {MOST_MM} mm: check the row, or calibrate anew")]
+    #[error(
+        "mark {id} is {off_mm:.1} mm from its target; a correction is for what is left after calibrating, at most {MOST_MM} mm: check the row, or calibrate anew"
+    )]
     TooFar {
         /// The mark.
         id: u64,
@@ -77,7 +79,11 @@ impl Layer {
     pub(crate) fn at(&self, base: Vector3<f64>) -> Vector3<f64> {
         let off = |m: &Mark| m.target.vector() - m.mark.vector();
         let far = |m: &Mark| (m.target.vector() - base).norm() / self.reach_mm;
-        let near = self.marks.iter().map(|m| (far(m), off(m))).filter(|(far, _)| *far < 1.0);
+        let near = self
+            .marks
+            .iter()
+            .map(|m| (far(m), off(m)))
+            .filter(|(far, _)| *far < 1.0);
         match self.between {
             Between::Nearest => near
                 .min_by(|a, b| a.0.total_cmp(&b.0))

@@ -61,7 +61,12 @@ impl Drift {
     /// The largest over the whole capture, mm, and in standard errors.
     pub fn largest(&self) -> (f64, f64) {
         (0..3)
-            .map(|a| (self.mm_per_h[a].abs() * self.hours, self.mm_per_h[a].abs() / self.sigma_mm_per_h[a].max(1e-12)))
+            .map(|a| {
+                (
+                    self.mm_per_h[a].abs() * self.hours,
+                    self.mm_per_h[a].abs() / self.sigma_mm_per_h[a].max(1e-12),
+                )
+            })
             .fold((0.0, 0.0), |best, now| if now.1 > best.1 { now } else { best })
     }
 }
@@ -97,7 +102,11 @@ pub fn diagnose(pairs: &[Pair], settings: &Settings) -> Result<(Map, Diagnosis),
     let (map, fit) = Map::fit(pairs, settings)?;
     let doubted: std::collections::HashSet<u64> = fit.rejected.iter().map(|r| r.id).collect();
     let valid: Vec<usize> = (0..pairs.len()).filter(|&i| pairs[i].valid).collect();
-    let believed: Vec<usize> = valid.iter().copied().filter(|&i| !doubted.contains(&pairs[i].id)).collect();
+    let believed: Vec<usize> = valid
+        .iter()
+        .copied()
+        .filter(|&i| !doubted.contains(&pairs[i].id))
+        .collect();
     // what a fold leaves out is spread over the volume, also where the file is in the order of a lattice
     let order = spread(&valid);
     let mut visits: Vec<Judged> = pairs
@@ -115,7 +124,11 @@ pub fn diagnose(pairs: &[Pair], settings: &Settings) -> Result<(Map, Diagnosis),
         .collect();
     for fold in 0..FOLDS {
         let left_out: Vec<usize> = order.iter().copied().skip(fold).step_by(FOLDS).collect();
-        let others: Vec<Pair> = valid.iter().filter(|i| !left_out.contains(i)).map(|&i| pairs[i].clone()).collect();
+        let others: Vec<Pair> = valid
+            .iter()
+            .filter(|i| !left_out.contains(i))
+            .map(|&i| pairs[i].clone())
+            .collect();
         let (without, _) = Map::fit(&others, settings)?;
         for i in left_out {
             judge(&without, &pairs[i], &mut visits[i]);
@@ -123,7 +136,8 @@ pub fn diagnose(pairs: &[Pair], settings: &Settings) -> Result<(Map, Diagnosis),
     }
     let errors = |of: &dyn Fn(&Judged) -> bool| -> Vec<(Vector3<f64>, Vector3<f64>)> {
         let of = believed.iter().filter(|&&i| of(&visits[i]));
-        of.filter_map(|&i| Some((Vector3::from(visits[i].error_mm), map.ray(pairs[i].camera?)))).collect()
+        of.filter_map(|&i| Some((Vector3::from(visits[i].error_mm), map.ray(pairs[i].camera?))))
+            .collect()
     };
     let middle = map.volume().at([0.5; 3]);
     let octant = |p: Point<Base>| {
@@ -211,13 +225,14 @@ fn fewer(pairs: &[Pair], believed: &[usize], settings: &Settings) -> Vec<WithFew
     // something has to be left to predict
     for points in NUMBERS.into_iter().filter(|&n| n + 20 <= order.len()) {
         // every `stride`-th of the spread order, so that the fit and what it is asked are both spread
-        let picked: std::collections::HashSet<usize> =
-            (0..points).map(|k| order[k * order.len() / points]).collect();
+        let picked: std::collections::HashSet<usize> = (0..points).map(|k| order[k * order.len() / points]).collect();
         let of = |inside: bool| -> Vec<Pair> {
             let of = order.iter().filter(|i| picked.contains(i) == inside);
             of.map(|&i| pairs[i].clone()).collect()
         };
-        let Ok((map, report)) = Map::fit(&of(true), settings) else { continue };
+        let Ok((map, report)) = Map::fit(&of(true), settings) else {
+            continue;
+        };
         let errors: Vec<_> = of(false)
             .iter()
             .filter_map(|p| {
@@ -248,7 +263,10 @@ fn drift<'a>(visits: impl Iterator<Item = &'a Judged>) -> Option<Drift> {
     let line = |a: usize| {
         let mean = rows.iter().map(|r| r.1[a]).sum::<f64>() / n;
         let slope = rows.iter().map(|r| (r.0 - mean_t) * (r.1[a] - mean)).sum::<f64>() / spread_t;
-        let left = rows.iter().map(|r| (r.1[a] - mean - slope * (r.0 - mean_t)).powi(2)).sum::<f64>();
+        let left = rows
+            .iter()
+            .map(|r| (r.1[a] - mean - slope * (r.0 - mean_t)).powi(2))
+            .sum::<f64>();
         (slope, (left / (n - 2.0) / spread_t).sqrt())
     };
     let lines = [line(0), line(1), line(2)];
@@ -271,9 +289,9 @@ fn advice(d: &Diagnosis) -> Vec<String> {
             "the errors drift by {mm:.2} mm over the capture: let arm and camera warm up first, and visit in random order"
         ));
     }
-    let worst = (0..8).filter(|&k| d.octants[k].n >= 5).max_by(|&a, &b| {
-        d.octants[a].total.rms_mm.total_cmp(&d.octants[b].total.rms_mm)
-    });
+    let worst = (0..8)
+        .filter(|&k| d.octants[k].n >= 5)
+        .max_by(|&a, &b| d.octants[a].total.rms_mm.total_cmp(&d.octants[b].total.rms_mm));
     if let Some(k) = worst
         && d.octants[k].total.rms_mm > 1.6 * rms
     {
@@ -290,7 +308,11 @@ fn advice(d: &Diagnosis) -> Vec<String> {
         words.push(format!(
             "the stated 95 % interval holds {:.0} % of the errors: {}",
             100.0 * d.coverage[1],
-            if d.coverage[1] < 0.9 { "there are more outliers than the fit could know" } else { "sigma is too careful" }
+            if d.coverage[1] < 0.9 {
+                "there are more outliers than the fit could know"
+            } else {
+                "sigma is too careful"
+            }
         ));
     }
     if let [.., half, last] = d.fewer.as_slice()

@@ -1,13 +1,12 @@
 //! The map from camera to robot: fitted from pairs, kept in a file with all that made it, asked for points with their sigma.
 
 use crate::{
-    Figures, FitError, FitReport, Level, Pair, Rejected, Volume,
+    Figures, FitError, FitReport, Level, Pair, Rejected, Volume, correct,
     gp::{self, Choice, Gp},
-    correct,
     lattice::{Estimate, Grid, LEVELS, MAX_LEVERAGE, Model, Shape, believable, split},
     pair, realign,
-    ripple::Ripple,
     rigid::{self, Points, quantile},
+    ripple::Ripple,
     tps::{self, Spline},
 };
 use geometry::{Base, Camera, CameraModel, Point, Transform};
@@ -300,7 +299,12 @@ impl Map {
                 .zip(&fitted.left_out)
                 .map(|(&i, e)| (*e, ray(i)))
                 .collect(),
-            (None, Some(bent)) => bent.0.iter().zip(&bent.1.left_out).map(|(&i, e)| (*e, ray(i))).collect(),
+            (None, Some(bent)) => bent
+                .0
+                .iter()
+                .zip(&bent.1.left_out)
+                .map(|(&i, e)| (*e, ray(i)))
+                .collect(),
             (None, None) => (0..).zip(&held).map(|(i, e)| (e.base - command[i], ray(i))).collect(),
         };
         let rigid_errors: Vec<_> = (0..used.len())
@@ -509,7 +513,12 @@ impl Map {
         let spline = match file.settings.method {
             Method::Tps => {
                 let again = spline(&camera, &command);
-                Some(again.ok_or_else(|| bad("its points do not determine it".into()))?.1.spline)
+                Some(
+                    again
+                        .ok_or_else(|| bad("its points do not determine it".into()))?
+                        .1
+                        .spline,
+                )
             }
             _ => None,
         };
@@ -632,7 +641,10 @@ impl Map {
 
     /// The rigid part of the map: good to some millimetres, for directions and for planning.
     pub fn base_from_camera(&self) -> Transform<Base, Camera> {
-        self.file.base_from_camera
+        match &self.file.realigned {
+            Some(layer) => Transform::from_isometry(self.file.base_from_camera.isometry() * layer.then_from_now()),
+            None => self.file.base_from_camera,
+        }
     }
 
     pub(crate) fn ray(&self, camera: Point<Camera>) -> Vector3<f64> {
@@ -669,7 +681,10 @@ fn gaussian(pairs: &[Pair], points: &Points, keep: &mut [bool]) -> Result<gp::Fi
     if used.len() < method.fewest_pairs() {
         return Err(too_few);
     }
-    used = spread(used.len(), gp::MOST_POINTS).into_iter().map(|k| used[k]).collect();
+    used = spread(used.len(), gp::MOST_POINTS)
+        .into_iter()
+        .map(|k| used[k])
+        .collect();
     let of = |all: &[Vector3<f64>]| -> Vec<Vector3<f64>> { used.iter().map(|&i| all[i]).collect() };
     let joints: Option<Vec<_>> = used.iter().map(|&i| first_joints(&pairs[points.index[i]])).collect();
     let mut fitted = gp::fit(&of(&points.camera), &of(&points.command), joints.as_deref()).ok_or(too_few)?;

@@ -37,7 +37,9 @@ pub enum PoseError {
     #[error("no hand-eye calibration as easy_handeye writes it: {0}")]
     Syntax(String),
     /// A camera on the robot's hand.
-    #[error("the camera of this pose is on the robot's hand (eye_on_hand); a cell has it fixed: calibrate with eye_on_base")]
+    #[error(
+        "the camera of this pose is on the robot's hand (eye_on_hand); a cell has it fixed: calibrate with eye_on_base"
+    )]
     EyeOnHand,
     /// A quaternion that is none.
     #[error("its quaternion has length {length:.4} instead of 1; check the file")]
@@ -46,7 +48,9 @@ pub enum PoseError {
         length: f64,
     },
     /// A length that cannot be metres.
-    #[error("the camera would be {metres:.0} m from the robot: easy_handeye's lengths are metres, divide millimetres by 1000")]
+    #[error(
+        "the camera would be {metres:.0} m from the robot: easy_handeye's lengths are metres, divide millimetres by 1000"
+    )]
     Millimetres {
         /// What it says.
         metres: f64,
@@ -97,11 +101,11 @@ impl HandEye {
         let t = file.transformation;
         let quaternion = Quaternion::new(t.qw, t.qx, t.qy, t.qz);
         let length = quaternion.norm();
-        if !((length - 1.0).abs() < 1e-2) {
+        if length.is_nan() || (length - 1.0).abs() > 1e-2 {
             return Err(PoseError::Quaternion { length });
         }
-        let metres = [t.x, t.y, t.z].into_iter().map(f64::abs).fold(0.0, f64::max);
-        if !(metres < FAR_M) {
+        let metres = t.x.abs() + t.y.abs() + t.z.abs();
+        if metres.is_nan() || metres > FAR_M {
             return Err(PoseError::Millimetres { metres });
         }
         Ok(Self {
@@ -182,7 +186,13 @@ mod tests {
         assert!(matches!(long, Err(PoseError::Quaternion { .. })), "{long:?}");
         let mm = with("x: 1000, y: 0, z: 2, qx: 0, qy: 0, qz: 0, qw: 1", false);
         assert!(matches!(mm, Err(PoseError::Millimetres { .. })), "{mm:?}");
-        for text in ["", "x", "transformation: {x: 1}", "parameters: [", "transformation: {x: .nan, y: 0, z: 2, qx: 0, qy: 0, qz: 0, qw: 1}"] {
+        for text in [
+            "",
+            "x",
+            "transformation: {x: 1}",
+            "parameters: [",
+            "transformation: {x: .nan, y: 0, z: 2, qx: 0, qy: 0, qz: 0, qw: 1}",
+        ] {
             assert!(HandEye::from_yaml(text).is_err(), "{text}");
         }
     }

@@ -3,7 +3,7 @@
 //! A camera that was bumped sees every point as if the world had moved: that is taken out before the map is asked, so that what
 //! the map knows of the arm stays where the arm is. Joint zeros that a crash has changed are taken out after it.
 
-use crate::{Figures, Map, Pair, ripple::Ripple, rigid};
+use crate::{Figures, Map, Pair, rigid, ripple::Ripple};
 use geometry::{Camera, Point};
 use nalgebra::{DMatrix, DVector, Isometry3, Matrix3, Point3, Translation3, UnitQuaternion, Vector3};
 use serde::{Deserialize, Serialize};
@@ -62,7 +62,9 @@ impl Moved {
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum RealignError {
     /// Not enough fresh pairs with a marker.
-    #[error("{have} pairs with a marker are too few for '{moved}', which needs {need}; visit more points, or ask for less")]
+    #[error(
+        "{have} pairs with a marker are too few for '{moved}', which needs {need}; visit more points, or ask for less"
+    )]
     TooFew {
         /// Pairs with a marker.
         have: usize,
@@ -72,7 +74,9 @@ pub enum RealignError {
         moved: &'static str,
     },
     /// Joint zeros without joint angles.
-    #[error("joint zeros need the joint angles of a GP25 (columns q1_rad to q6_rad, tool in one direction): realign with 'pose'")]
+    #[error(
+        "joint zeros need the joint angles of a GP25 (columns q1_rad to q6_rad, tool in one direction): realign with 'pose'"
+    )]
     NoJoints,
     /// A pair with NaN or an infinite number.
     #[error("pair {id} is valid but holds a number that is not finite; mark it as not valid")]
@@ -122,10 +126,18 @@ impl fmt::Display for Realignment {
             self.moved.name()
         )?;
         if let Some([j2, j3]) = self.zeros_rad {
-            writeln!(f, "the zeros of J2 and J3 are off by {:+.3} and {:+.3} mrad", 1e3 * j2, 1e3 * j3)?;
+            writeln!(
+                f,
+                "the zeros of J2 and J3 are off by {:+.3} and {:+.3} mrad",
+                1e3 * j2,
+                1e3 * j3
+            )?;
         }
         for id in &self.outliers {
-            writeln!(f, "pair {id} contradicts the others and was left out: look at its picture")?;
+            writeln!(
+                f,
+                "pair {id} contradicts the others and was left out: look at its picture"
+            )?;
         }
         write!(
             f,
@@ -139,7 +151,6 @@ impl fmt::Display for Realignment {
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub(crate) struct Layer {
     pub(crate) told: Realignment,
-    /// Where the camera as it stood would have seen what it sees now.
     then_from_now: Isometry3<f64>,
     /// Turns of J2 and J3, and the arm that they turn.
     zeros: Option<([f64; 2], Ripple)>,
@@ -148,6 +159,11 @@ pub(crate) struct Layer {
 }
 
 impl Layer {
+    /// Where the camera as it stood would have seen what it sees now.
+    pub(crate) fn then_from_now(&self) -> Isometry3<f64> {
+        self.then_from_now
+    }
+
     /// A point as the camera would have seen it when the map was fitted.
     pub(crate) fn before(&self, camera: Point<Camera>) -> Point<Camera> {
         Point::from_vector((self.then_from_now * Point3::from(camera.vector())).coords)
@@ -189,11 +205,17 @@ fn levers(arm: &Ripple, base: Vector3<f64>) -> [Vector3<f64>; 2] {
 }
 
 /// How the mapped point moves with shift, turn and zeros: 3 rows, base frame.
-fn jacobian(moved: Moved, rotation: &Matrix3<f64>, camera: Vector3<f64>, levers: Option<[Vector3<f64>; 2]>) -> DMatrix<f64> {
+fn jacobian(
+    moved: Moved,
+    rotation: &Matrix3<f64>,
+    camera: Vector3<f64>,
+    levers: Option<[Vector3<f64>; 2]>,
+) -> DMatrix<f64> {
     let mut out = DMatrix::zeros(3, moved.unknowns());
     out.view_mut((0, 0), (3, 3)).copy_from(rotation);
     if moved != Moved::Shift {
-        out.view_mut((0, 3), (3, 3)).copy_from(&(rotation * -camera.cross_matrix()));
+        out.view_mut((0, 3), (3, 3))
+            .copy_from(&(rotation * -camera.cross_matrix()));
     }
     if let (Moved::PoseAndZeros, Some(levers)) = (moved, levers) {
         out.set_column(6, &DVector::from_column_slice(levers[0].as_slice()));
@@ -245,14 +267,22 @@ impl Map {
         }
         let arm = (moved == Moved::PoseAndZeros).then(|| {
             let command: Vec<_> = usable.iter().map(|(p, _)| p.command.vector()).collect();
-            let joints: Option<Vec<_>> = usable.iter().map(|(p, _)| p.joints_rad.map(|q| [q[0], q[1], q[2]])).collect();
+            let joints: Option<Vec<_>> = usable
+                .iter()
+                .map(|(p, _)| p.joints_rad.map(|q| [q[0], q[1], q[2]]))
+                .collect();
             Ripple::of_arm(&command, &joints?)
         });
         let arm = match arm {
             Some(found) => Some(found.or_else(|| self.arm().cloned()).ok_or(RealignError::NoJoints)?),
             None => None,
         };
-        let rotation = *self.base_from_camera().isometry().rotation.to_rotation_matrix().matrix();
+        let rotation = *fitted
+            .base_from_camera()
+            .isometry()
+            .rotation
+            .to_rotation_matrix()
+            .matrix();
         let fresh: Vec<Fresh> = usable
             .iter()
             .map(|(pair, camera)| {
@@ -272,7 +302,10 @@ impl Map {
         let mut solution = fitted.solve(&fresh, &used, moved, &rotation, arm.as_ref());
         for _ in 0..3 {
             // a least median start may have thrown out good points, or kept a bad one
-            let scores: Vec<f64> = all.iter().map(|&i| fitted.left(&fresh[i], &solution, arm.as_ref()).1).collect();
+            let scores: Vec<f64> = all
+                .iter()
+                .map(|&i| fitted.left(&fresh[i], &solution, arm.as_ref()).1)
+                .collect();
             let scale = rigid::median(scores.clone()).max(1.0);
             let again: Vec<usize> = all.iter().copied().filter(|&i| scores[i] < MAX_SCORE * scale).collect();
             if again == used || again.len() < need {
@@ -285,7 +318,8 @@ impl Map {
             let with_ray = |(error, i): (Vector3<f64>, usize)| (error, rotation * fresh[i].camera.normalize());
             Figures::of(&errors.into_iter().map(with_ray).collect::<Vec<_>>())
         };
-        let error_as_it_was = |i: usize| self.apply(Point::from_vector(fresh[i].camera)).base.vector() - fresh[i].command;
+        let error_as_it_was =
+            |i: usize| self.apply(Point::from_vector(fresh[i].camera)).base.vector() - fresh[i].command;
         let left_out = |i: usize| {
             let others: Vec<usize> = used.iter().copied().filter(|&k| k != i).collect();
             let without = fitted.solve(&fresh, &others, moved, &rotation, arm.as_ref());
@@ -295,7 +329,11 @@ impl Map {
             moved,
             date: date.to_owned(),
             n_used: used.len(),
-            outliers: all.iter().filter(|i| !used.contains(i)).map(|&i| usable[i].0.id).collect(),
+            outliers: all
+                .iter()
+                .filter(|i| !used.contains(i))
+                .map(|&i| usable[i].0.id)
+                .collect(),
             shift_mm: solution.then_from_now.translation.vector.norm(),
             turn_rad: solution.then_from_now.rotation.angle(),
             zeros_rad: arm.as_ref().map(|_| solution.turns),
@@ -319,7 +357,10 @@ impl Map {
         let left: Vec<f64> = if moved == Moved::Shift {
             let off = |a: usize| rigid::median(said.iter().zip(fresh).map(|(s, f)| f.command[a] - s[a]).collect());
             let shift = Vector3::from_fn(|a, _| off(a));
-            said.iter().zip(fresh).map(|(s, f)| (f.command - s - shift).norm()).collect()
+            said.iter()
+                .zip(fresh)
+                .map(|(s, f)| (f.command - s - shift).norm())
+                .collect()
         } else {
             let command: Vec<_> = fresh.iter().map(|f| f.command).collect();
             let (motion, _) = rigid::least_median(&said, &command);
@@ -378,7 +419,11 @@ impl Map {
             }
             let Some(factor) = normal.cholesky() else { break };
             let step = factor.solve(&right);
-            let turn = if n > 3 { Vector3::new(step[3], step[4], step[5]) } else { Vector3::zeros() };
+            let turn = if n > 3 {
+                Vector3::new(step[3], step[4], step[5])
+            } else {
+                Vector3::zeros()
+            };
             let move_ = Isometry3::from_parts(
                 Translation3::new(step[0], step[1], step[2]),
                 UnitQuaternion::from_scaled_axis(turn),
@@ -391,5 +436,4 @@ impl Map {
         }
         solution
     }
-
 }

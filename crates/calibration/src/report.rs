@@ -276,7 +276,10 @@ pub fn verify(map: &Map, pairs: &[Pair], limit_mm: f64) -> Verification {
 
 /// Errors of one rigid motion, such as another tool's hand-eye calibration, at pairs.
 pub fn rigid_figures(base_from_camera: &Transform<Base, Camera>, pairs: &[Pair]) -> Figures {
-    let seen = pairs.iter().filter(|p| p.valid).filter_map(|p| Some((p.command, p.camera?)));
+    let seen = pairs
+        .iter()
+        .filter(|p| p.valid)
+        .filter_map(|p| Some((p.command, p.camera?)));
     let rotation = base_from_camera.isometry().rotation;
     let errors: Vec<_> = seen
         .map(|(command, camera)| {

@@ -63,7 +63,9 @@ impl Spline {
         let shrink = eigen.eigenvalues.map(|v| 1.0 / (v.max(0.0) + best));
         let bent = &basis * DMatrix::from_fn(seen.nrows(), 3, |i, a| seen[(i, a)] * shrink[i]);
         let rest = &residuals - &kernel * &bent - &bent * best;
-        let flat = (affine.transpose() * &affine).cholesky()?.solve(&(affine.transpose() * rest));
+        let flat = (affine.transpose() * &affine)
+            .cholesky()?
+            .solve(&(affine.transpose() * rest));
         let weights = Matrix3xX::from_fn(n + 4, |a, i| if i < n { bent[(i, a)] } else { flat[(i - n, a)] });
         Some(Fitted {
             left_out: left_out(best),
@@ -95,7 +97,8 @@ impl Spline {
 /// An orthonormal basis of what is orthogonal to the columns.
 fn complement(columns: &DMatrix<f64>) -> Option<DMatrix<f64>> {
     let n = columns.nrows();
-    let projector = DMatrix::identity(n, n) - columns * (columns.transpose() * columns).cholesky()?.solve(&columns.transpose());
+    let projector =
+        DMatrix::identity(n, n) - columns * (columns.transpose() * columns).cholesky()?.solve(&columns.transpose());
     let eigen = SymmetricEigen::new(projector);
     let kept: Vec<usize> = (0..n).filter(|&i| eigen.eigenvalues[i] > 0.5).collect();
     Some(DMatrix::from_fn(n, kept.len(), |i, k| eigen.eigenvectors[(i, kept[k])]))
@@ -141,9 +144,18 @@ mod tests {
         let fitted = Spline::fit(&camera, &command).ok_or("determined")?;
         let k = 21;
         let mut without = (camera.clone(), command.clone());
-        (without.0.remove(k), without.1.remove(k));
-        let off = Spline::fit(&without.0, &without.1).ok_or("determined")?.spline.at(camera[k]) - command[k];
-        assert!((fitted.left_out[k] - off).norm() < 0.05 * off.norm().max(0.1), "{off:?} {:?}", fitted.left_out[k]);
+        without.0.remove(k);
+        without.1.remove(k);
+        let off = Spline::fit(&without.0, &without.1)
+            .ok_or("determined")?
+            .spline
+            .at(camera[k])
+            - command[k];
+        assert!(
+            (fitted.left_out[k] - off).norm() < 0.05 * off.norm().max(0.1),
+            "{off:?} {:?}",
+            fitted.left_out[k]
+        );
         Ok(())
     }
 }

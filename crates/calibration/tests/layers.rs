@@ -10,7 +10,10 @@ use nalgebra::{Isometry3, Vector3};
 /// A camera pushed by 1 mm and turned by 2 mrad about its own place.
 fn bumped() -> World {
     World {
-        bump: Isometry3::new(Vector3::new(0.6, -0.7, 0.4), 2e-3 * Vector3::new(0.5, 0.7, -0.5).normalize()),
+        bump: Isometry3::new(
+            Vector3::new(0.6, -0.7, 0.4),
+            2e-3 * Vector3::new(0.5, 0.7, -0.5).normalize(),
+        ),
         ..World::untouched()
     }
 }
@@ -31,9 +34,15 @@ fn ten_points_restore_the_map_after_a_bump() -> Result<(), Box<dyn std::error::E
     for seed in 20..26 {
         let (realigned, told) = map.realign(&world.pairs(seed, 10), Moved::Pose, "2026-01-02T03:04:05Z")?;
         let now = p999(&world.errors(&realigned, 7));
-        assert!(now < 0.25 && now < as_fitted + 0.15, "{seed}: {now} after, {as_fitted} as fitted");
+        assert!(
+            now < 0.25 && now < as_fitted + 0.15,
+            "{seed}: {now} after, {as_fitted} as fitted"
+        );
         assert!((told.turn_rad - 2e-3).abs() < 2e-4, "{told}");
-        assert!(told.outliers.is_empty() && told.before.total.rms_mm > 4.0 * told.after.total.rms_mm, "{told}");
+        assert!(
+            told.outliers.is_empty() && told.before.total.rms_mm > 4.0 * told.after.total.rms_mm,
+            "{told}"
+        );
     }
     Ok(())
 }
@@ -92,7 +101,10 @@ fn sigma_of_a_realigned_map_holds_what_few_points_leave_open() -> Result<(), Box
         n += 200.0;
     }
     let [one, two] = within.map(|w| w / n);
-    assert!((0.62..0.76).contains(&one) && (0.92..0.985).contains(&two), "{one} {two}");
+    assert!(
+        (0.62..0.76).contains(&one) && (0.92..0.985).contains(&two),
+        "{one} {two}"
+    );
     Ok(())
 }
 
@@ -107,6 +119,10 @@ fn a_realigned_map_survives_its_file_and_a_second_realignment() -> Result<(), Bo
     assert_eq!(back.realigned(), Some(&told));
     let at = world.sight([0.1, 0.4, -0.8]);
     assert!(back.apply(at).base.distance_mm(realigned.apply(at).base) < 1e-9);
+    // what other tools are told of the camera's pose has moved with it
+    let rigid = |map: &Map, world: &World| (map.base_from_camera() * world.sight([0.1, 0.4, -0.8])).vector();
+    let moved = rigid(&realigned, &world) - rigid(&map, &World::untouched());
+    assert!(moved.norm() < 0.3, "{moved:?}");
     // the camera is put back: the second realignment stands alone
     let (again, _) = back.realign(&pairs(99, 12), Moved::Pose, "")?;
     assert!(p999(&World::untouched().errors(&again, 3)) < 0.25);
@@ -117,7 +133,10 @@ fn a_realigned_map_survives_its_file_and_a_second_realignment() -> Result<(), Bo
 fn what_is_no_bump_is_refused() {
     let map = fitted(6);
     let few = map.realign(&bumped().pairs(1, 5), Moved::Pose, "");
-    assert!(matches!(few, Err(RealignError::TooFew { have: 5, need: 7, .. })), "{few:?}");
+    assert!(
+        matches!(few, Err(RealignError::TooFew { have: 5, need: 7, .. })),
+        "{few:?}"
+    );
     let mut shuffled = bumped().pairs(1, 12);
     let first = shuffled[0].command;
     for k in 0..11 {
@@ -128,7 +147,10 @@ fn what_is_no_bump_is_refused() {
     assert!(matches!(wrong, Err(RealignError::Disagree { .. })), "{wrong:?}");
     let mut nan = bumped().pairs(1, 12);
     nan[4].command = Point::new(f64::NAN, 0.0, 0.0);
-    assert!(matches!(map.realign(&nan, Moved::Pose, ""), Err(RealignError::NotFinite { id: 4 })));
+    assert!(matches!(
+        map.realign(&nan, Moved::Pose, ""),
+        Err(RealignError::NotFinite { id: 4 })
+    ));
 }
 
 #[test]
@@ -170,7 +192,10 @@ fn needle_marks_are_taken_out_where_they_are_and_fade_beyond() -> Result<(), Box
         }
         last = Some(shift);
     }
-    assert_eq!(map.correct(&[], Between::Nearest, 100.0).err(), Some(CorrectError::None));
+    assert_eq!(
+        map.correct(&[], Between::Nearest, 100.0).err(),
+        Some(CorrectError::None)
+    );
     let gross = map.correct(&[mark(1, target, 20.0 * off)], Between::Nearest, 100.0);
     assert!(matches!(gross.err(), Some(CorrectError::TooFar { id: 1, .. })));
     Ok(())

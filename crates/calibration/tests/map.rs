@@ -337,8 +337,8 @@ fn a_map_survives_its_file_and_knows_its_cell() {
         Map::load(&path).expect_err("must be refused")
     };
     assert!(matches!(
-        refused(&text.replacen("\"version\":2", "\"version\":3", 1)),
-        MapError::Version { found: 3, .. }
+        refused(&text.replacen("\"version\":2", "\"version\":4", 1)),
+        MapError::Version { found: 4, .. }
     ));
     assert!(matches!(refused(&text[..text.len() / 2]), MapError::Format { .. }));
     assert!(matches!(

@@ -13,7 +13,11 @@ fn a_good_capture_is_called_good() -> Result<(), Box<dyn std::error::Error>> {
     assert_eq!(d.visits.len(), 120);
     assert!(d.visits.iter().all(|v| v.mapped.is_some()));
     assert!(d.held_out.total.rms_mm < 0.15 && d.held_out.n >= 118, "{}", d.held_out);
-    assert!((0.6..0.78).contains(&d.coverage[0]) && (0.9..0.99).contains(&d.coverage[1]), "{:?}", d.coverage);
+    assert!(
+        (0.6..0.78).contains(&d.coverage[0]) && (0.9..0.99).contains(&d.coverage[1]),
+        "{:?}",
+        d.coverage
+    );
     assert!(d.split_half.expect("two halves").rms_mm < 0.2);
     let rms: Vec<f64> = d.fewer.iter().map(|f| f.figures.total.rms_mm).collect();
     assert!(rms.len() >= 4 && rms[0] > 1.3 * rms[rms.len() - 1], "{rms:?}");
@@ -35,7 +39,11 @@ fn drift_and_a_bad_corner_are_named() -> Result<(), Box<dyn std::error::Error>> 
     };
     // an arm that warms up by 0.4 mm over a quarter of an hour
     let (_, warm) = moved(&|p| Vector3::new(0.4 * p.t_s / 900.0, 0.0, 0.0))?;
-    assert!(warm.advice.iter().any(|a| a.contains("drift by 0.")), "{:?}", warm.advice);
+    assert!(
+        warm.advice.iter().any(|a| a.contains("drift by 0.")),
+        "{:?}",
+        warm.advice
+    );
     assert!(warm.drift.expect("times").largest().1 > 4.0);
     // light that spoils the measurements in one corner
     let (_, corner) = moved(&|p| {

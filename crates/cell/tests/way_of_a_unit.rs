@@ -373,7 +373,9 @@ fn on_a_stuck_cover_only_the_likeliest_doubtful_heads_are_tried() {
         if fake.world().presented != "top" {
             return;
         }
-        let unseen = found.iter().position(|screw| screw.camera.is_some_and(|p| p.x_mm() > 60.0));
+        let unseen = found
+            .iter()
+            .position(|screw| screw.camera.is_some_and(|p| p.x_mm() > 60.0));
         let Some(unseen) = unseen.map(|k| found.remove(k)).filter(|_| odds > 1.0) else {
             return;
         };
@@ -398,13 +400,20 @@ fn on_a_stuck_cover_only_the_likeliest_doubtful_heads_are_tried() {
     let program = Program::paper().expect("built-in program");
     let mut runner = runner_with(&fake, folder.path(), program, Altered(fake.clone(), grille));
     let record = block_on(runner.run_unit(&Silent)).expect("a record");
-    assert!(matches!(record.outcome, Some(Outcome::Ng { .. })), "{:?}", record.outcome);
+    assert!(
+        matches!(record.outcome, Some(Outcome::Ng { .. })),
+        "{:?}",
+        record.outcome
+    );
     let second = record.faces.iter().find(|f| f.purpose == Purpose::Missed);
     let second = second.expect("a second look at the stuck cover");
     assert_eq!(second.attempts.len(), 6, "the others are left to a person");
     let tried: Vec<f64> = second.attempts.iter().map(|a| second.found[a.found].score).collect();
     assert!(tried.iter().all(|score| *score > 0.8935), "{tried:?}");
-    assert!(second.attempts.iter().all(|a| a.bursts.len() <= 2), "no search around what is doubtful");
+    assert!(
+        second.attempts.iter().all(|a| a.bursts.len() <= 2),
+        "no search around what is doubtful"
+    );
 }
 
 #[test]

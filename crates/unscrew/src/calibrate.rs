@@ -3,8 +3,8 @@
 use crate::{Ended, diagnosis, output};
 use anyhow::{Result, bail};
 use calibration::{
-    Between, Check, HandEye, Identity, Map, Method, Moved, PlanError, Settings, Target, Volume, diagnose, lattice, read_marks, read_pairs,
-    read_queries, rigid_figures, scattered, verify,
+    Between, Check, HandEye, Identity, Map, Method, Moved, PlanError, Settings, Target, Volume, diagnose, lattice,
+    read_marks, read_pairs, read_queries, rigid_figures, scattered, verify,
 };
 use geometry::{Base, Point};
 use serde::Serialize;
@@ -336,7 +336,10 @@ fn report(args: &Report) -> Result<Ended> {
         println!("{}", serde_json::to_string_pretty(&found)?);
         return Ok(Ended::Good);
     }
-    println!("{} pairs, each predicted by a map fitted without it:\n{}", found.held_out.n, found.held_out);
+    println!(
+        "{} pairs, each predicted by a map fitted without it:\n{}",
+        found.held_out.n, found.held_out
+    );
     println!(
         "  within the stated sigma: {:.0} % (68 % expected); within the 95 % interval: {:.0} %",
         100.0 * found.coverage[0],
@@ -404,7 +407,9 @@ fn check(args: &Verify) -> Result<Ended> {
     let pairs = read_pairs(&args.pairs)?;
     let Some(path) = &args.map else {
         let pose = args.pose.as_deref().map(HandEye::read).transpose()?;
-        let Some(pose) = pose else { bail!("give a map by --map, or a pose by --pose") };
+        let Some(pose) = pose else {
+            bail!("give a map by --map, or a pose by --pose")
+        };
         let figures = rigid_figures(&pose.base_from_camera, &pairs);
         if args.json {
             println!("{}", serde_json::to_string_pretty(&figures)?);
@@ -452,9 +457,7 @@ fn export(args: &Export) -> Result<Ended> {
 fn realign(args: &Realign) -> Result<Ended> {
     let map = Map::load(&args.map)?;
     let pairs = read_pairs(&args.pairs)?;
-    let moved = args
-        .moved
-        .unwrap_or_else(|| Moved::for_pairs(&pairs));
+    let moved = args.moved.unwrap_or_else(|| Moved::for_pairs(&pairs));
     let (realigned, told) = map.realign(&pairs, moved, &output::now_utc())?;
     realigned.save(&args.out)?;
     if args.json {

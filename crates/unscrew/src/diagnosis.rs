@@ -47,13 +47,23 @@ the noise of its measurement included.</p><div class=\"cards\">",
         d.fit.rejected.len(),
         d.fit.n_invalid,
     )?;
-    let mut card = |figure: String, what: &str| write!(out, "<div class=\"card\"><b>{figure}</b><span>{what}</span></div>");
+    let mut card =
+        |figure: String, what: &str| write!(out, "<div class=\"card\"><b>{figure}</b><span>{what}</span></div>");
     card(format!("{:.3} mm", total.rms_mm), "rms, 3D")?;
     card(format!("{:.3} mm", total.p999_mm), "99.9 % are within")?;
-    card(format!("{:.0} %", 100.0 * d.coverage[1]), "of the errors in the stated 95 % interval")?;
-    card(format!("{:.0} %", 100.0 * volume_covered(map)), "of the volume is calibrated; the rest is its edge")?;
+    card(
+        format!("{:.0} %", 100.0 * d.coverage[1]),
+        "of the errors in the stated 95 % interval",
+    )?;
+    card(
+        format!("{:.0} %", 100.0 * volume_covered(map)),
+        "of the volume is calibrated; the rest is its edge",
+    )?;
     if let Some(half) = &d.split_half {
-        card(format!("{:.3} mm", half.rms_mm), "rms between two maps from half of the pairs each")?;
+        card(
+            format!("{:.3} mm", half.rms_mm),
+            "rms between two maps from half of the pairs each",
+        )?;
     }
     out.push_str("</div><h2>What limits it, and what to do</h2><ul>");
     if d.advice.is_empty() {
@@ -143,9 +153,8 @@ fn cut(map: &Map, d: &Diagnosis, [across, up, through]: [usize; 3]) -> Drawn {
             .x_desc(format!("{} of the base, mm", AXES[across]))
             .y_desc(AXES[up])
             .draw()?;
-        let near = |v: &&Judged| {
-            (v.command.to_array()[through] - middle).abs() <= HALF_CUT * (high[through] - low[through])
-        };
+        let near =
+            |v: &&Judged| (v.command.to_array()[through] - middle).abs() <= HALF_CUT * (high[through] - low[through]);
         for visit in d.visits.iter().filter(near) {
             let at = visit.command.to_array();
             let place = (at[across], at[up]);
@@ -210,10 +219,18 @@ fn spread(d: &Diagnosis) -> Drawn {
         // of a normal distribution (Abramowitz and Stegun 7.1.26)
         let erf = |x: f64| {
             let t = 1.0 / (1.0 + 0.327_591_1 * x);
-            let poly = [0.254_829_592, -0.284_496_736, 1.421_413_741, -1.453_152_027, 1.061_405_429];
+            let poly = [
+                0.254_829_592,
+                -0.284_496_736,
+                1.421_413_741,
+                -1.453_152_027,
+                1.061_405_429,
+            ];
             1.0 - poly.iter().rev().fold(0.0, |sum, c| (sum + c) * t) * (-x * x).exp()
         };
-        let normal = (0..=80).map(|k| f64::from(k) / 20.0).map(|x| (x, erf(x / std::f64::consts::SQRT_2)));
+        let normal = (0..=80)
+            .map(|k| f64::from(k) / 20.0)
+            .map(|x| (x, erf(x / std::f64::consts::SQRT_2)));
         plot.draw_series(LineSeries::new(normal, BLACK.mix(0.5)))?;
         root.present()?;
     }
@@ -241,7 +258,9 @@ fn course(d: &Diagnosis) -> Drawn {
             .y_desc("error, mm")
             .draw()?;
         for (a, color) in [RED, GREEN, BLUE].into_iter().enumerate() {
-            let points = used.iter().map(|v| Circle::new((minutes(v), v.error_mm[a]), 2, color.mix(0.6).filled()));
+            let points = used
+                .iter()
+                .map(|v| Circle::new((minutes(v), v.error_mm[a]), 2, color.mix(0.6).filled()));
             plot.draw_series(points)?
                 .label(AXES[a])
                 .legend(move |(x, y)| Circle::new((x + 8, y), 3, color.filled()));

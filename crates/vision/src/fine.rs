@@ -86,7 +86,9 @@ fn mean(looks: &[&Evidence]) -> Evidence {
         center,
         sigma_px: (share * (over(&|e| e.sigma_px.powi(2)) + spread)).sqrt(),
         diameter_px: over(&|e| e.diameter_px.ln()).exp(),
-        probability: normalized(std::array::from_fn(|c| over(&|e| f64::from(ln(e.probability[c]))) as f32)),
+        probability: normalized(std::array::from_fn(|c| {
+            over(&|e| f64::from(ln(e.probability[c]))) as f32
+        })),
     }
 }
 
