@@ -13,6 +13,9 @@ use nalgebra::{Matrix3, Rotation3, UnitQuaternion, Vector3};
 /// Shortest way in front of a screw on which the bit can still be lined up, mm.
 const SHORTEST_STANDOFF_MM: f64 = 8.0;
 
+/// The screws of a face stand no farther in front of its plane or behind it, mm: ribs and sunk flanges.
+const ON_FACE_MM: f64 = 20.0;
+
 /// A place that an arm may be sent to: the point and the straight way to it lie in the calibrated volume of that arm's map.
 ///
 /// ```compile_fail
@@ -145,7 +148,12 @@ pub fn is_doubtful(fits: f64, odds: f64) -> bool {
 /// # Arguments
 /// * `before` – finds of the same face when it was looked at without the odds: what was in doubt then and is now is likelier than
 ///   what one of two pictures shows.
-pub fn bound_doubtful(screws: &mut [vision::Screw], odds: f64, most: usize, before: &[Found]) {
+/// * `face` – where the face lies: what is deep behind it is a gap of a grille.
+pub fn bound_doubtful(screws: &mut [vision::Screw], odds: f64, most: usize, before: &[Found], face: Option<&FaceFit>) {
+    let on_face = |screw: &vision::Screw| match (face, screw.camera) {
+        (Some(face), Some(at)) => (at.z_mm() - face.depth_mm(screw.pixel)).abs() <= ON_FACE_MM,
+        _ => false, // no depth, no target
+    };
     let seen_before = |screw: &vision::Screw| {
         let near = |f: &&Found| (f.u_px - screw.pixel.u_px).hypot(f.v_px - screw.pixel.v_px) < screw.diameter_px;
         let in_doubt = before.iter().filter(|f| f.verdict == Verdict::Review).filter(near);
@@ -157,7 +165,8 @@ pub fn bound_doubtful(screws: &mut [vision::Screw], odds: f64, most: usize, befo
     let alone = |s: &vision::Screw| s.fits / (s.fits + odds * (1.0 - s.fits));
     let mut doubtful: Vec<(f64, &mut vision::Screw)> = doubtful.map(|s| (alone(s).max(seen_before(s)), s)).collect();
     doubtful.sort_by(|a, b| b.0.total_cmp(&a.0));
-    for (_, screw) in doubtful.into_iter().skip(most) {
+    let (likely, behind): (Vec<_>, Vec<_>) = doubtful.into_iter().partition(|(_, s)| on_face(s));
+    for (_, screw) in likely.into_iter().skip(most).chain(behind) {
         screw.verdict = Verdict::Review;
     }
 }

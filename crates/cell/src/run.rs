@@ -468,12 +468,15 @@ impl Way<'_> {
         let shot = shoot(&self.runner.devices, None, config.inspection.depth_frames).await?;
         let odds = self.odds(purpose);
         let mut screws = self.runner.finder.find(&shot.frame, odds);
+        self.budget(&shot);
+        let certain = screws
+            .iter()
+            .filter(|s| !plan::is_doubtful(s.fits, odds) || s.verdict == Verdict::Other);
+        let heads: Vec<(Pixel, f64)> = certain.map(|s| (s.pixel, s.diameter_px)).collect();
+        let fit = FaceFit::around(&shot.frame, &heads, config.inspection.working_depth_mm);
         let before = self.record.faces.iter().rev().find(|f| f.face == *face);
         let before = before.map_or(&[][..], |f| &f.found);
-        plan::bound_doubtful(&mut screws, odds, config.inspection.doubtful_max, before);
-        self.budget(&shot);
-        let heads: Vec<(Pixel, f64)> = screws.iter().map(|s| (s.pixel, s.diameter_px)).collect();
-        let fit = FaceFit::around(&shot.frame, &heads, config.inspection.working_depth_mm);
+        plan::bound_doubtful(&mut screws, odds, config.inspection.doubtful_max, before, fit.as_ref());
         let (found, targets) = plan::plan(&screws, &shot, fit.as_ref(), &self.reaches(), &config);
         let picture = self
             .runner
@@ -821,8 +824,8 @@ impl Way<'_> {
         if self.pull(index, step).await? == PullEnd::Off {
             return Ok(());
         }
-        // A screw that is known to stand holds the cover: looking for others would not free it.
-        if let Some(known) = self.known_standing(held_by) {
+        // A screw that is known to stand holds the cover: looking for others would not free it. One that the bit never met may be none.
+        if let Some(known) = self.known_standing(held_by, |end| end != Some(DriveEnd::MissedHead)) {
             return Err(Stop::Decided(known));
         }
         self.observer.note(&format!(
@@ -845,16 +848,19 @@ impl Way<'_> {
         if !pulled_again && self.pull(index, step).await? == PullEnd::Off {
             return Ok(self.log(Event::Recovery { on: false })?);
         }
-        Err(Stop::Decided(self.known_standing(held_by).unwrap_or_else(|| {
-            Outcome::Ng {
+        Err(Stop::Decided(self.known_standing(held_by, |_| true).unwrap_or_else(
+            || Outcome::Ng {
                 reason: NgReason::CoverStuck,
                 detail: format!("the {cover} cover did not come off, and no screw that holds it was seen"),
-            }
-        })))
+            },
+        )))
     }
 
     /// A screw on these faces that is known to stand, as the reason of a failure.
-    fn known_standing(&self, faces: &[FaceId]) -> Option<Outcome> {
+    ///
+    /// # Arguments
+    /// * `counts` – which ends of an attempt say that there is one.
+    fn known_standing(&self, faces: &[FaceId], counts: fn(Option<DriveEnd>) -> bool) -> Option<Outcome> {
         for face in faces {
             let Some(last) = self.record.faces.iter().rev().find(|f| f.face == *face) else {
                 continue;
@@ -862,7 +868,7 @@ impl Way<'_> {
             let failed = last
                 .attempts
                 .iter()
-                .find(|a| !a.removed() && a.still_there != Some(false));
+                .find(|a| !a.removed() && a.still_there != Some(false) && counts(a.end()));
             if let Some(attempt) = failed {
                 let (reason, what) = match attempt.end() {
                     Some(DriveEnd::Seized) => (NgReason::ScrewSeized, "did not turn"),
