@@ -30,7 +30,7 @@ mod tests;
 mod world;
 
 pub use faults::{Fault, FaultError, Faults};
-pub use log::LogError;
+pub use log::{LogError, read_actions};
 pub use mechanics::ArmErrors;
 pub use score::{Action, ActionKind, Aim, Score, ScrewScore, UnitScore};
 pub use world::unit_seed;

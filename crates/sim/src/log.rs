@@ -40,6 +40,35 @@ pub enum LogError {
     },
 }
 
+/// Reads a world's log: every physical action so far, in order. A last line that a crash cut off is passed over.
+///
+/// # Errors
+/// [`LogError::File`], [`LogError::Line`].
+pub fn read_actions(path: &Path) -> Result<Vec<Action>, LogError> {
+    let text = std::fs::read_to_string(path).map_err(|source| LogError::File {
+        path: path.to_owned(),
+        source,
+    })?;
+    parse(path, &text[..whole(&text)])
+}
+
+/// Bytes of the whole lines.
+fn whole(text: &str) -> usize {
+    text.rfind('\n').map_or(0, |end| end + 1)
+}
+
+fn parse(path: &Path, text: &str) -> Result<Vec<Action>, LogError> {
+    let lines = text.lines().enumerate();
+    let actions = lines.map(|(k, line)| {
+        serde_json::from_str(line).map_err(|e| LogError::Line {
+            path: path.to_owned(),
+            line: k + 1,
+            reason: e.to_string(),
+        })
+    });
+    actions.collect()
+}
+
 /// A log that is open for appending.
 #[derive(Debug)]
 pub(crate) struct ActionLog {
@@ -60,16 +89,8 @@ impl ActionLog {
             Err(e) if e.kind() == std::io::ErrorKind::NotFound => String::new(),
             Err(e) => return Err(file_error(e)),
         };
-        let whole = text.rfind('\n').map_or(0, |end| end + 1);
-        let lines = text[..whole].lines().enumerate();
-        let actions = lines.map(|(k, line)| {
-            serde_json::from_str(line).map_err(|e| LogError::Line {
-                path: path.to_owned(),
-                line: k + 1,
-                reason: e.to_string(),
-            })
-        });
-        let actions = actions.collect::<Result<Vec<Action>, LogError>>()?;
+        let whole = whole(&text);
+        let actions = parse(path, &text[..whole])?;
         let file = OpenOptions::new()
             .create(true)
             .append(true)

@@ -4,6 +4,7 @@
 //! the result is not good enough (screws left, verification failed).
 
 mod annotations;
+mod audit;
 mod calibrate;
 mod curve;
 mod detect;

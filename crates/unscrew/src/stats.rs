@@ -1,11 +1,14 @@
 //! `unscrew stats`: what a run's journal says of rates and times.
 
 use crate::Ended;
+use crate::audit::{Actions, audit};
 use anyhow::Result;
 use cell::{journal::Journal, statistics::Statistics};
+use serde::Serialize;
 use std::path::PathBuf;
 
-/// Rates with Wilson bounds over units in scope and over all, times by resource, causes; from the journal alone.
+/// Rates with Wilson bounds over units in scope and over all, times by resource, causes; from the journal. In simulation, also whether
+/// journal and world agree on every action.
 #[derive(clap::Args)]
 #[command(after_help = "Example: unscrew stats out --json")]
 pub struct Args {
@@ -16,14 +19,34 @@ pub struct Args {
     json: bool,
 }
 
+/// What `--json` prints.
+#[derive(Serialize)]
+struct Printed {
+    #[serde(flatten)]
+    statistics: Statistics,
+    #[serde(flatten)]
+    actions: Option<Actions>,
+}
+
 pub fn run(args: &Args) -> Result<Ended> {
     let journal = Journal::open_read_only(&args.run)?;
     let records = journal.records()?;
     let statistics = Statistics::over(&records);
+    let world = args.run.join("world.jsonl");
+    let actions = world
+        .exists()
+        .then(|| audit(&journal, &sim::read_actions(&world)?))
+        .transpose()?;
     if args.json {
-        println!("{}", serde_json::to_string_pretty(&statistics)?);
-    } else {
-        print!("{}", text(&statistics));
+        println!("{}", serde_json::to_string_pretty(&Printed { statistics, actions })?);
+        return Ok(Ended::Good);
+    }
+    print!("{}", text(&statistics));
+    if let Some(a) = actions {
+        println!(
+            "actions    {} by the world's own log; {} repeated, {} lost",
+            a.actions_total, a.actions_repeated, a.actions_lost
+        );
     }
     Ok(Ended::Good)
 }
