@@ -311,10 +311,11 @@ impl FaceFit {
         Direction::from_vector(-Vector3::new(wu * self.camera.fx_px, wv * self.camera.fy_px, w))
     }
 
-    /// How far heads lean from the face together: one that is seated askew does not move the median. `None` with fewer than three.
+    /// How far heads lean from the face together: one that is seated askew does not move the median. `None` with fewer than five: one head's
+    /// top is measured to 3° (95 % within 11°), and of three such measurements the median is still off by 10° now and then.
     pub fn lean_rad(&self, heads: impl Iterator<Item = Direction<Camera>>) -> Option<f64> {
         let heads: Vec<_> = heads.collect();
-        if heads.len() < 3 {
+        if heads.len() < 5 {
             return None;
         }
         let axis = |a: usize| median(heads.iter().map(|n| n.vector()[a]));

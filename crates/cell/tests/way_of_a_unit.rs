@@ -178,9 +178,10 @@ fn a_bent_face_excludes_and_a_survey_sees_it_before_the_first_screw() {
 }
 
 #[test]
-fn screws_that_lean_together_exclude_a_single_one_does_not() {
-    let face = || vec![screw(-100.0, 0.0), screw(0.0, 50.0), screw(100.0, 0.0)];
-    for (count, excluded) in [(3, true), (2, false)] {
+fn screws_that_lean_together_exclude_a_few_do_not() {
+    let places = [(-100.0, 0.0), (0.0, 50.0), (100.0, 0.0), (50.0, -50.0), (-50.0, -50.0)];
+    let face = || places.map(|(x, y)| screw(x, y)).to_vec();
+    for (count, excluded) in [(5, true), (4, false)] {
         let fake = Fake::new(&[("front", face()[..count].to_vec())]);
         fake.world().lean_rad.insert("front".into(), 11f64.to_radians());
         let record = run(&fake);
