@@ -222,7 +222,7 @@ fn judge(
         sigma_lateral_mm: mapped.map(|m| m.sigma_lateral_mm.hypot(screw.sigma_lateral_mm.unwrap_or(0.0))),
         sigma_depth_mm: mapped.map(|m| m.sigma_depth_mm.hypot(screw.sigma_depth_mm.unwrap_or(0.0))),
         hull: mapped.map(|m| m.hull),
-        tilt_rad: leaning(sheet, screw.top_normal),
+        tilt_rad: leaning(sheet, head_normal(screw)),
         left_alone: None,
     };
     let place = target(screw, &found, shot, sheet, face, arms, config);
@@ -266,7 +266,7 @@ fn target(
     {
         return Err(LeftAlone::Bent);
     }
-    let normal = line_of_approach(sheet, screw.top_normal, face, config).ok_or(LeftAlone::NoDepth)?;
+    let normal = line_of_approach(sheet, head_normal(screw), face, config).ok_or(LeftAlone::NoDepth)?;
     let mut refused = LeftAlone::HullOutside;
     for reach in arms {
         match SafeTarget::locate(reach.map, reach.arm, point, normal, config.approach.standoff_mm) {
@@ -283,6 +283,11 @@ fn is_head_size(diameter_px: f64, point: Point<Camera>, shot: &Shot, config: &Ce
     let [least, most] = config.inspection.head_mm;
     let scale = shot.frame.camera.map(|camera| camera.pixel_mm(point.z_mm()));
     scale.is_none_or(|mm| (least..=most).contains(&(diameter_px * mm)))
+}
+
+/// Normal of the head's top; where that was not measured, of the sheet as it agrees with that around the other heads.
+fn head_normal(screw: &vision::Screw) -> Option<Direction<Camera>> {
+    screw.top_normal.or(screw.normal)
 }
 
 /// How far the sheet leans. Two independent measurements, the sheet around the head and the top of the head, have to say so: an edge

@@ -179,10 +179,13 @@ impl SimulatedCell {
         lock(&self.world).score()
     }
 
-    /// What is really on the face that stands before the camera, screws already out included; `None` while none does. For
+    /// What is really on the face that stands before the camera, without the screws that are out; `None` while none does. For
     /// reports and evaluation, never for deciding.
     pub fn face_truth(&self) -> Option<FaceTruth> {
-        lock(&self.world).truth().map(|truth| (*truth).clone())
+        let mut world = lock(&self.world);
+        let mut truth = (*world.truth()?).clone();
+        truth.screws.retain(|screw| !world.is_out(screw.id));
+        Some(truth)
     }
 
     /// What the plant was told: one JSON text a finished unit.

@@ -406,6 +406,11 @@ impl World {
         Some(truth)
     }
 
+    /// True if a screw of the unit on the table has been taken out.
+    pub(crate) fn is_out(&self, screw: ScrewId) -> bool {
+        self.unit.as_ref().is_some_and(|u| u.removed.contains(&screw))
+    }
+
     /// A number that changes whenever the picture would.
     pub(crate) fn state_number(&self) -> u64 {
         match &self.unit {
