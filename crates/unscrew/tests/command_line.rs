@@ -191,8 +191,6 @@ fn fit_and_apply_keep_the_contract() {
     assert!(!at.join("no.json").exists());
 }
 
-/// One whole unit, calibrated on a wide lattice: nothing the robot was sent to lies outside the calibrated volume, the page and the
-/// summary are there, a second run into the same folder is refused, and the journal's statistics are those of the summary.
 #[test]
 fn a_reader_that_has_seen_enough_ends_a_command_quietly() {
     let mut child = Command::new(env!("CARGO_BIN_EXE_unscrew"))
@@ -207,6 +205,8 @@ fn a_reader_that_has_seen_enough_ends_a_command_quietly() {
     assert!(text.is_empty(), "{text}");
 }
 
+/// One whole unit, calibrated on a wide lattice: nothing the robot was sent to lies outside the calibrated volume, the page and the
+/// summary are there, a second run into the same folder is refused, and the journal's statistics are those of the summary.
 #[test]
 fn a_unit_from_end_to_end() {
     let dir = folder();
@@ -230,7 +230,11 @@ fn a_unit_from_end_to_end() {
     let page = fs::read_to_string(at.join("out/report.html")).expect("report");
     assert!(page.contains("78.3 %") && page.contains("report/unit001-00-"));
     let stats = unscrew(at, &["stats", "out", "--json"]);
-    let stats: Value = serde_json::from_slice(&stats.stdout).expect("JSON");
+    let mut stats: Value = serde_json::from_slice(&stats.stdout).expect("JSON");
+    let counted = stats.as_object_mut().expect("an object");
+    let mut count = |name: &str| counted.remove(name).and_then(|n| n.as_u64());
+    assert!(count("actions_total") >= removed["hits"].as_u64());
+    assert_eq!((count("actions_repeated"), count("actions_lost")), (Some(0), Some(0)));
     assert_eq!(stats, summary["statistics"]);
     refused(at, &["run", "--units", "1", "--out", "out"], &["out", "--resume"]);
 }
