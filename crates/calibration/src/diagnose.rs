@@ -188,11 +188,8 @@ fn coverage<'a>(visits: impl Iterator<Item = &'a Judged>) -> [f64; 2] {
     for visit in visits {
         let Some(mapped) = visit.mapped else { continue };
         n += 2;
-        // the length of two components: 68.27 % within 1.515 sigma, 95 % within 2.448
-        for (k, (across, along)) in [(1.5151, 1.0), (2.4477, 1.96)].into_iter().enumerate() {
-            within[k] += usize::from(visit.lateral_mm <= across * mapped.sigma_lateral_mm);
-            within[k] += usize::from(visit.depth_mm.abs() <= along * mapped.sigma_depth_mm);
-        }
+        let inside = crate::report::within(&mapped, visit.lateral_mm, visit.depth_mm);
+        within = [within[0] + inside[0], within[1] + inside[1]];
     }
     within.map(|w| w as f64 / n.max(1) as f64)
 }

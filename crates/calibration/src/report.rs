@@ -1,6 +1,6 @@
 //! Is the map good, in millimetres, and where is it not?
 
-use crate::{Hull, Level, Map, Pair, rigid::quantile};
+use crate::{Hull, Level, Map, MappedPoint, Pair, rigid::quantile};
 use geometry::{Base, Camera, Transform};
 use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
@@ -229,20 +229,15 @@ pub struct Verification {
 pub fn verify(map: &Map, pairs: &[Pair], limit_mm: f64) -> Verification {
     let mut hulls = [0usize; 3];
     let (mut errors, mut worst, mut beyond) = (Vec::new(), Vec::new(), Vec::new());
-    let (mut one, mut two) = (0usize, 0usize);
+    let (mut within_one, mut within_two) = (0, 0);
     for pair in pairs.iter().filter(|p| p.valid) {
         let Some(camera) = pair.camera else { continue };
         let mapped = map.apply(camera);
         let error = mapped.base.vector() - pair.command.vector();
         let ray = map.ray(camera);
         let (lateral_mm, depth_mm) = crate::lattice::split(error, ray);
-        // the length of two components is within 1.515 sigma in 68.27 % of cases, within 2.448 sigma in 95 %
-        let within = |across: f64, along: f64| {
-            usize::from(lateral_mm <= across * mapped.sigma_lateral_mm)
-                + usize::from(depth_mm.abs() <= along * mapped.sigma_depth_mm)
-        };
-        one += within(1.5151, 1.0);
-        two += within(2.4477, 1.96);
+        let [one, two] = within(&mapped, lateral_mm, depth_mm);
+        (within_one, within_two) = (within_one + one, within_two + two);
         hulls[mapped.hull as usize] += 1;
         beyond.push(beyond_limit(mapped.sigma_lateral_mm, mapped.sigma_depth_mm, limit_mm));
         errors.push((error, ray));
@@ -267,11 +262,20 @@ pub fn verify(map: &Map, pairs: &[Pair], limit_mm: f64) -> Verification {
         false_alarm: more_than_a_twentieth(&beyond),
         n_invalid: pairs.iter().filter(|p| !p.valid).count(),
         figures,
-        within_one_sigma: one as f64 / (2.0 * n),
-        within_two_sigma: two as f64 / (2.0 * n),
+        within_one_sigma: within_one as f64 / (2.0 * n),
+        within_two_sigma: within_two as f64 / (2.0 * n),
         mean_error_mm: (errors.iter().map(|(e, _)| e).sum::<Vector3<f64>>() / n).into(),
         worst,
     }
+}
+
+/// How many of the two parts of an error, across the ray and along it, lie within one stated sigma, and within the stated 95 % interval.
+pub(crate) fn within(mapped: &MappedPoint, lateral_mm: f64, depth_mm: f64) -> [usize; 2] {
+    // the length of two components is within 1.515 sigma in 68.27 % of cases, within 2.448 sigma in 95 %
+    [(1.5151, 1.0), (2.4477, 1.96)].map(|(across, along)| {
+        usize::from(lateral_mm <= across * mapped.sigma_lateral_mm)
+            + usize::from(depth_mm.abs() <= along * mapped.sigma_depth_mm)
+    })
 }
 
 /// Errors of one rigid motion, such as another tool's hand-eye calibration, at pairs.
