@@ -329,6 +329,12 @@ fn report(args: &Report) -> Result<Ended> {
         date: output::now_utc(),
         ..Settings::default()
     };
+    if pairs.len() > 400 {
+        eprintln!(
+            "unscrew: fitting some twenty maps to parts of {} pairs: about a minute",
+            pairs.len()
+        );
+    }
     let (map, found) = diagnose(&pairs, &settings)?;
     let name = args.pairs.file_name().unwrap_or(args.pairs.as_os_str());
     diagnosis::write(&map, &found, &name.to_string_lossy(), &args.out)?;
