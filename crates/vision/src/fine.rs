@@ -34,7 +34,7 @@ pub struct Evidence {
     pub sigma_px: f64,
     /// Diameter of the head, px.
     pub diameter_px: f64,
-    /// Probability of each [`Class`]: geometric mean over the cells around the centre, networks and views.
+    /// Probability of each [`Class`]: mean over the networks, then geometric mean over the cells around the centre and the views.
     pub probability: [f32; CLASSES],
 }
 
