@@ -76,7 +76,7 @@ pub struct Batch {
 }
 
 /// Draws a batch: patch `picks[i]`, augmented by seed.
-pub fn batch(stage: Stage, patches: &[Patch], picks: &[usize], seed: u64) -> Batch {
+pub fn batch(stage: Stage, patches: &[&Patch], picks: &[usize], seed: u64) -> Batch {
     let side = stage.side_px();
     let cells = side / STRIDE;
     let channels = stage.input_channels();
@@ -90,7 +90,7 @@ pub fn batch(stage: Stage, patches: &[Patch], picks: &[usize], seed: u64) -> Bat
         .enumerate()
         .for_each(|(i, ((pixels, targets), &pick))| {
             let mut rng = Pcg64Mcg::seed_from_u64(seed.wrapping_mul(0x9E37_79B9_7F4A_7C15) ^ (i as u64) << 20);
-            fill(stage, &patches[pick], &mut rng, pixels, targets);
+            fill(stage, patches[pick], &mut rng, pixels, targets);
         });
     Batch { input, targets }
 }

@@ -7,6 +7,7 @@
 mod batch;
 mod evaluate;
 mod face;
+mod pictures;
 mod real;
 mod samples;
 mod train;

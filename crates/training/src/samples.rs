@@ -101,7 +101,8 @@ pub fn cut(view: &Prepared, all: &[(Pixel, f64, Classes)], center: Pixel, focuse
     )
 }
 
-fn from_picture(
+/// The patch that a picture of [`PATCH_PX`]² pixels is, whose first pixel is `corner`, with the labels that lie in it, nearest to `center` first.
+pub(crate) fn from_picture(
     picture: &RgbImage,
     all: &[(Pixel, f64, Classes)],
     corner: [f64; 2],

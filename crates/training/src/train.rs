@@ -1,10 +1,11 @@
-//! Training: patches, four networks, thresholds, one model file; the same bytes from the same settings on any number of threads.
+//! Training: patches, a network a stage, thresholds, one model file; the same bytes from the same settings on any number of threads.
 
 use crate::batch::{Batch, Stage, batch, loss};
+use crate::pictures;
 use crate::real;
 use crate::samples::{Patch, any_fastener, only, rendered};
 use crate::tune::{self, Tuning};
-use nn::{Tensor, Trainer};
+use nn::{Spec, Tensor, Trainer};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use serde::Serialize;
@@ -17,8 +18,6 @@ use std::{
 use vision::layout::{Class, coarse_spec, fine_spec};
 use vision::{Detector, Settings, Thresholds, decode_model, encode_model};
 
-/// Networks in the ensemble of stage 2, as in the paper.
-const ENSEMBLE: u64 = 3;
 /// Units below this seed are learned from.
 pub const TRAINING_SEEDS: Range<u64> = 0..500_000;
 /// Units whose faces set thresholds and sigma factors.
@@ -27,6 +26,8 @@ pub const TUNING_SEEDS: Range<u64> = 500_000..1_000_000;
 const WARM_UP: usize = 100;
 /// Weight of the places in the last quarter of the steps, when the classes are nearly learned, against that before.
 const LATE_PLACE: f32 = 4.0;
+/// Share of a batch that comes from pictures from elsewhere, against all others together.
+const PICTURED: f64 = 0.3;
 /// What decides beside the settings what a network learns: a network half trained by another recipe is not gone on with.
 const RECIPE: [&str; 2] = [include_str!("batch.rs"), include_str!("../../vision/src/clip.rs")];
 /// Steps after which a network is written to the work folder.
@@ -64,6 +65,14 @@ pub enum TrainError {
     /// The model could not be put together.
     #[error(transparent)]
     Model(#[from] vision::ModelError),
+    /// A truth file of the pictures to learn from.
+    #[error("{path}: {reason}; expected rgb, screws (u, v, head_d_px, detectable) and negatives (kind, u, v, d_px)")]
+    Truth {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        reason: String,
+    },
     /// More units than there are seeds for.
     #[error("{units} units to learn from; at most {} are set aside for it", TRAINING_SEEDS.end)]
     TooManyUnits {
@@ -87,10 +96,8 @@ pub struct TrainSettings {
     pub learning_rate: f32,
     /// Steps of stage 1.
     pub coarse_steps: usize,
-    /// Steps of each network of stage 2, those that they share included.
+    /// Steps of stage 2.
     pub fine_steps: usize,
-    /// The first steps, which the networks of stage 2 share.
-    pub shared_steps: usize,
     /// Faces that set thresholds and sigma factors.
     pub tuning_faces: u64,
     /// Seed of everything.
@@ -100,6 +107,11 @@ pub struct TrainSettings {
     pub from: Option<PathBuf>,
     /// Identity of that model.
     pub from_model: Option<String>,
+    /// Folder of more pictures with exact truth, as `path_traced.py` makes them; `None` has none.
+    #[serde(skip)]
+    pub pictures: Option<PathBuf>,
+    /// Identity of those pictures.
+    pub pictures_id: Option<String>,
     /// Folder where rendered patches and half-trained networks are kept, so that a stopped training goes on; `None` keeps nothing.
     #[serde(skip)]
     pub work: Option<PathBuf>,
@@ -120,11 +132,12 @@ impl Default for TrainSettings {
             learning_rate: 0.01,
             coarse_steps: 1900,
             fine_steps: 11000,
-            shared_steps: 9500,
             tuning_faces: 150,
             seed: 1,
             from: None,
             from_model: None,
+            pictures: None,
+            pictures_id: None,
             work: None,
             data: PathBuf::from("crates/training/data"),
             date: String::new(),
@@ -162,7 +175,14 @@ pub fn train(settings: &TrainSettings, out: &Path, progress: &dyn Progress) -> R
         return Err(TrainError::TooManyUnits { units: settings.units });
     }
     let real = real::patches(&settings.data, settings.seed)?; // first: a missing folder is said at once
-    let (settings, start) = &begun(settings)?;
+    let (pictured, pictures_id) = match &settings.pictures {
+        Some(folder) => pictures::patches(folder, settings.seed).map(|(patches, id)| (patches, Some(id)))?,
+        None => (Vec::new(), None),
+    };
+    let (settings, start) = &begun(&TrainSettings {
+        pictures_id,
+        ..settings.clone()
+    })?;
     let mut patches = rendered(
         settings.first_unit..settings.first_unit + settings.units,
         settings.background,
@@ -171,39 +191,28 @@ pub fn train(settings: &TrainSettings, out: &Path, progress: &dyn Progress) -> R
             progress.report("rendering", done, settings.units, None);
         },
     )?;
-    let counted = count(&patches, &real);
+    let mut counted = count("rendered", &patches);
+    counted.extend(count("real", &real));
+    counted.extend(count("pictured", &pictured));
     patches.extend(real);
     let lesson = Lesson {
         settings,
         patches: &patches,
+        pictured: &pictured,
         progress,
     };
     let mut losses = BTreeMap::new();
-    let coarse = match start.get("coarse") {
-        Some(bytes) => Trainer::from_bytes(bytes)?,
-        None => Trainer::new(coarse_spec(), settings.seed),
-    };
-    let coarse = lesson.learn("coarse", coarse, Stage::Coarse, settings.coarse_steps, &mut losses)?;
-    // the members of the ensemble share their first steps, then each goes its own way
-    let shared = if settings.from.is_some() {
-        0
-    } else {
-        settings.shared_steps
-    };
-    let trunk = Trainer::new(fine_spec(), settings.seed + 1);
-    let trunk = lesson.learn("shared", trunk, Stage::Fine, shared, &mut losses)?;
-    let mut fine = Vec::new();
-    for k in 0..ENSEMBLE {
-        let name = format!("fine{k}");
-        let trainer = match start.get(&name) {
+    let mut learned = |name: &str, kept: &str, spec: Spec, stage: Stage, seed: u64| {
+        let trainer = match start.get(kept) {
             Some(bytes) => Trainer::from_bytes(bytes)?,
-            None => trunk.clone(),
+            None => Trainer::new(spec, seed),
         };
-        let trainer = lesson.learn(&name, trainer, Stage::Fine, settings.fine_steps, &mut losses)?;
-        fine.push(trainer.to_bytes(&BTreeMap::new())?);
-    }
-    let coarse = coarse.to_bytes(&BTreeMap::new())?;
-    drop(patches);
+        let trainer = lesson.learn(name, trainer, stage, &mut losses)?;
+        Ok::<_, TrainError>(trainer.to_bytes(&BTreeMap::new())?)
+    };
+    let coarse = learned("coarse", "coarse", coarse_spec(), Stage::Coarse, settings.seed)?;
+    let fine = [learned("fine", "fine0", fine_spec(), Stage::Fine, settings.seed + 1)?];
+    drop((patches, pictured));
     let untuned = Settings {
         thresholds: Thresholds::default(),
         ..Settings::default()
@@ -235,14 +244,12 @@ pub fn train(settings: &TrainSettings, out: &Path, progress: &dyn Progress) -> R
     })
 }
 
-fn count(rendered: &[Patch], real: &[Patch]) -> BTreeMap<String, usize> {
+fn count(origin: &str, patches: &[Patch]) -> BTreeMap<String, usize> {
     let mut counts = BTreeMap::new();
-    for (origin, patches) in [("rendered", rendered), ("real", real)] {
-        for patch in patches {
-            *counts
-                .entry(format!("{origin} {}", Pool::of(patch).name()))
-                .or_default() += 1;
-        }
+    for patch in patches {
+        *counts
+            .entry(format!("{origin} {}", Pool::of(patch).name()))
+            .or_default() += 1;
     }
     counts
 }
@@ -338,12 +345,14 @@ pub struct Lesson<'a> {
     pub settings: &'a TrainSettings,
     /// What is learned from.
     pub patches: &'a [Patch],
+    /// Patches of pictures from elsewhere, learned from beside them.
+    pub pictured: &'a [Patch],
     /// Where it says how far it is.
     pub progress: &'a dyn Progress,
 }
 
 impl Lesson<'_> {
-    /// Trains from the step where the trainer is up to the `last`, and puts the loss over the last steps into `losses`.
+    /// Trains from the step where the trainer is up to the last, and puts the loss over the last steps into `losses`.
     ///
     /// # Errors
     /// [`TrainError`] for the work folder.
@@ -352,16 +361,23 @@ impl Lesson<'_> {
         name: &str,
         mut trainer: Trainer,
         stage: Stage,
-        last: usize,
         losses: &mut BTreeMap<String, f32>,
     ) -> Result<Trainer, TrainError> {
         let settings = self.settings;
-        let total = match stage {
+        let last = match stage {
             Stage::Coarse => settings.coarse_steps,
             Stage::Fine => settings.fine_steps,
         };
         let kept = settings.work.as_ref().map(|folder| {
-            let key = json!([RECIPE, settings_key(settings), trainer.spec(), name]).to_string();
+            let key = json!([
+                RECIPE,
+                WARM_UP,
+                LATE_PLACE,
+                settings_key(settings),
+                trainer.spec(),
+                name
+            ])
+            .to_string();
             folder.join(format!(
                 "{name}-{}.checkpoint",
                 &geometry::sha256_hex(key.as_bytes())[..12]
@@ -377,19 +393,20 @@ impl Lesson<'_> {
             let loss = nn::metadata(&bytes).ok().and_then(|m| m.get("loss")?.parse().ok());
             mean_loss = loss.unwrap_or(f32::NAN);
         }
-        let pools = pools(self.patches, stage);
+        let pools = pools(self.patches, self.pictured, stage);
+        let all: Vec<&Patch> = self.patches.iter().chain(self.pictured).collect();
         let mut grad = Tensor::default();
         for step in trainer.steps() as usize..last {
             // a generator a step: a training that goes on draws what it would have drawn
             let mut rng = Pcg64Mcg::seed_from_u64(hash(&[settings.seed, name_hash(name), step as u64]));
             let picks = picks(&pools, settings.batch, &mut rng);
-            let Batch { input, targets } = batch(stage, self.patches, &picks, rng.random());
+            let Batch { input, targets } = batch(stage, &all, &picks, rng.random());
             let output = trainer.forward(&input);
-            let place = if 4 * step >= 3 * total { LATE_PLACE } else { 1.0 };
+            let place = if 4 * step >= 3 * last { LATE_PLACE } else { 1.0 };
             let now = loss(stage, &output, &targets, place, &mut grad);
             trainer.backward(&grad);
             let rise = ((step + 1) as f32 / WARM_UP as f32).min(1.0);
-            let rate = settings.learning_rate * rise * (1.0 - step as f32 / total as f32);
+            let rate = settings.learning_rate * rise * (1.0 - step as f32 / last as f32);
             trainer.adam_step(rate, 0.0);
             mean_loss = if mean_loss.is_nan() {
                 now
@@ -438,8 +455,8 @@ fn name_hash(name: &str) -> u64 {
     hash(&name.bytes().map(u64::from).collect::<Vec<_>>())
 }
 
-/// Patches by pool, with each pool's share of a batch.
-fn pools(patches: &[Patch], stage: Stage) -> Vec<(f64, Vec<usize>)> {
+/// Indices of patches by pool, those of the pictures from elsewhere after the others, with each pool's share of a batch.
+fn pools(patches: &[Patch], pictured: &[Patch], stage: Stage) -> Vec<(f64, Vec<usize>)> {
     let mut pools: Vec<(f64, Vec<usize>)> = Pool::ALL
         .iter()
         .map(|&pool| {
@@ -447,6 +464,7 @@ fn pools(patches: &[Patch], stage: Stage) -> Vec<(f64, Vec<usize>)> {
             (pool.share(stage), members)
         })
         .collect();
+    pools.push((PICTURED, (patches.len()..patches.len() + pictured.len()).collect()));
     pools.retain(|p| !p.1.is_empty());
     pools
 }

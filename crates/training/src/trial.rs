@@ -51,12 +51,13 @@ pub fn try_network(
             ..settings.clone()
         },
         patches: &patches,
+        pictured: &[],
         progress,
     };
     let begin = Instant::now();
     let mut losses = BTreeMap::new();
     let start = Trainer::new(spec, settings.seed);
-    let trainer = lesson.learn("trial", start, Stage::Fine, settings.fine_steps, &mut losses)?;
+    let trainer = lesson.learn("trial", start, Stage::Fine, &mut losses)?;
     let train_s = begin.elapsed().as_secs_f64();
     let first = TUNING_SEEDS.start + 100_000;
     let unseen = rendered(first..first + units, settings.background, work, &|_| {})?;

@@ -15,7 +15,6 @@ fn tiny(work: Option<&Path>) -> TrainSettings {
         batch: 8,
         coarse_steps: 4,
         fine_steps: 4,
-        shared_steps: 2,
         tuning_faces: 0,
         work: work.map(Path::to_owned),
         data: Path::new(env!("CARGO_MANIFEST_DIR")).join("data"),
@@ -32,13 +31,13 @@ fn a_training_that_was_stopped_ends_with_the_same_bytes() -> Result<(), Box<dyn 
     let in_one_go = fs::read(&out)?;
     let report = train(&tiny(Some(&work)), &out, &Silent)?;
     assert_eq!(fs::read(&out)?, in_one_go);
-    // as a stop leaves it: the third network not begun, one unit's patches not yet written
+    // as a stop leaves it: stage 2 not begun, one unit's patches not yet written
     let gone: Vec<_> = fs::read_dir(&work)?
         .filter_map(Result::ok)
         .filter(|f| {
             f.file_name()
                 .to_str()
-                .is_some_and(|n| n.starts_with("fine2") || n.ends_with(".patches"))
+                .is_some_and(|n| n.starts_with("fine-") || n.ends_with(".patches"))
         })
         .collect();
     assert_eq!(gone.len(), 2, "{gone:?}");
@@ -49,7 +48,7 @@ fn a_training_that_was_stopped_ends_with_the_same_bytes() -> Result<(), Box<dyn 
     assert_eq!(fs::read(&out)?, in_one_go);
     assert_eq!(again.loss, report.loss);
     assert!(
-        again.loss.len() == 5 && again.loss.values().all(|l| l.is_finite()),
+        again.loss.len() == 2 && again.loss.values().all(|l| l.is_finite()),
         "{:?}",
         again.loss
     );
@@ -73,5 +72,37 @@ fn a_damaged_work_folder_is_named() -> Result<(), Box<dyn std::error::Error>> {
         }
         fs::remove_file(file.path())?;
     }
+    Ok(())
+}
+
+#[test]
+fn pictures_with_truth_are_learned_from_or_named() -> Result<(), Box<dyn std::error::Error>> {
+    let folder = tempfile::tempdir()?;
+    let (out, pictures) = (folder.path().join("model.unscrew"), folder.path().join("pictures"));
+    let settings = TrainSettings {
+        pictures: Some(pictures.clone()),
+        ..tiny(None)
+    };
+    assert!(
+        matches!(train(&settings, &out, &Silent), Err(TrainError::Data { path, .. }) if path == pictures.join("truth"))
+    );
+    fs::create_dir_all(pictures.join("truth"))?;
+    fs::create_dir(pictures.join("rgb"))?;
+    let sheet = geometry::RgbImage::from_pixel(300, 200, image::Rgb([150; 3]));
+    geometry::write_jpeg(&pictures.join("rgb/a.jpg"), &sheet, 90)?;
+    let truth = pictures.join("truth/a.json");
+    fs::write(
+        &truth,
+        r#"{"rgb":"rgb/a.jpg","screws":[{"u":100,"v":90,"head_d_px":28,"detectable":true},{"u":40,"v":40,"head_d_px":28,"detectable":false}],
+            "negatives":[{"kind":"slotted","u":200,"v":90,"d_px":30},{"kind":"rivet","u":200,"v":20,"d_px":30,"visible":false}]}"#,
+    )?;
+    let report = train(&settings, &out, &Silent)?;
+    let counted = |kind: &str| report.patches.get(kind).copied();
+    assert_eq!(counted("pictured cross screws"), Some(1));
+    assert_eq!(counted("pictured other fasteners"), Some(1));
+    assert_eq!(counted("pictured other features"), None);
+    assert_eq!(counted("pictured background"), Some(12));
+    fs::write(&truth, r#"{"rgb":"rgb/a.jpg","screws":[{"u":100}],"negatives":[]}"#)?;
+    assert!(matches!(train(&settings, &out, &Silent), Err(TrainError::Truth { path, .. }) if path == truth));
     Ok(())
 }

@@ -118,7 +118,7 @@ pub fn run(args: &Args) -> Result<Ended> {
         ..Options::default()
     };
     let stop = output::stop_on_ctrl_c();
-    let mut failed = 0;
+    let (mut failed, mut doubtful) = (0, false);
     let mut annotated = Vec::new();
     let mut out = std::io::stdout().lock();
     for (k, image) in args.images.iter().enumerate() {
@@ -129,6 +129,10 @@ pub fn run(args: &Args) -> Result<Ended> {
         // one bad picture does not cost the others
         let found = one(args, image, depth, &detector, &options, map.as_ref(), &mut out);
         if let Ok(found) = &found {
+            for doubt in &found.doubts {
+                eprintln!("unscrew: {}: {doubt}", image.display());
+                doubtful = true;
+            }
             annotated.push(boxes(image, found));
         }
         if let Err(error) = found {
@@ -148,7 +152,7 @@ pub fn run(args: &Args) -> Result<Ended> {
     if failed > 0 {
         bail!("{failed} of {} pictures could not be used", args.images.len());
     }
-    Ok(Ended::Good)
+    Ok(if doubtful { Ended::NotGoodEnough } else { Ended::Good })
 }
 
 fn one(

@@ -61,6 +61,18 @@ fn bad_pictures_are_refused_by_name() {
 }
 
 #[test]
+fn a_picture_that_cannot_be_trusted_is_said() {
+    let dir = folder();
+    let white = image::RgbImage::from_pixel(200, 150, image::Rgb([255; 3]));
+    white.save(dir.path().join("white.png")).expect("a picture");
+    let output = unscrew(dir.path(), &["detect", "white.png", "--json"]);
+    assert_eq!(output.status.code(), Some(3));
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(said.contains("white.png: too bright to be trusted"), "{said}");
+    assert!(String::from_utf8_lossy(&output.stdout).contains(r#""doubts":[{"why":"over_exposed","share":1.0}]"#));
+}
+
+#[test]
 fn bad_companions_are_refused_by_name() {
     let dir = folder();
     let at = dir.path();

@@ -16,6 +16,7 @@ use crate::fine::{Evidence, look};
 use crate::layout::{CLIP_PX, Class, STRIDE};
 use crate::locate::{DepthSource, facings, locate, parallax_px};
 use crate::picture::{Level, pyramid_scales};
+use crate::quality::{Doubt, doubts};
 use crate::{Model, ModelError};
 
 /// Two finds nearer than this, in head diameters, are the same fastener.
@@ -199,6 +200,8 @@ pub struct Timing {
 pub struct Detections {
     /// The finds: those to act on first, most probable first.
     pub screws: Vec<Screw>,
+    /// Why none of them is to be acted on, and all that would be are for review; nothing where the picture can be trusted.
+    pub doubts: Vec<Doubt>,
     /// Time spent.
     pub timing_ms: Timing,
     /// The model that found them.
@@ -331,6 +334,11 @@ impl Detector {
                 Some(Screw { normal, ..screw })
             })
             .collect();
+        let doubts = doubts(picture, region, &options.head_px);
+        if !doubts.is_empty() {
+            let acted_on = screws.iter_mut().filter(|s| s.verdict == Verdict::Screw);
+            acted_on.for_each(|s| s.verdict = Verdict::Review);
+        }
         let rank = |s: &Screw| match s.verdict {
             Verdict::Screw => 0,
             Verdict::Review => 1,
@@ -346,6 +354,7 @@ impl Detector {
         timing_ms.total = ms_since(begin);
         Detections {
             screws,
+            doubts,
             timing_ms,
             model: self.model.id().to_owned(),
             size_px: picture.dimensions(),

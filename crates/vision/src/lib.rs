@@ -38,6 +38,7 @@ mod marker;
 mod model;
 mod overlay;
 mod picture;
+mod quality;
 mod report;
 #[cfg(test)]
 mod synthetic;
@@ -51,4 +52,5 @@ pub use locate::{DepthSource, Located, facings, locate, parallax_px};
 pub use marker::{LocatedMarker, Marker, MarkerError, MarkerSpec, find_marker, locate_marker};
 pub use model::{Corrections, Model, ModelError, Settings, Thresholds, decode_model, encode_model, model_id};
 pub use overlay::{overlay, verdict_color};
+pub use quality::{Doubt, doubts};
 pub use report::{Hull, ImageReport, Mapped, ScrewReport};

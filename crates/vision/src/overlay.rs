@@ -117,6 +117,7 @@ mod tests {
         };
         let picture = RgbImage::new(160, 120);
         let detections = Detections {
+            doubts: Vec::new(),
             screws: vec![at(60.0, 60.0), at(159.0, 0.0), at(f64::NAN, 0.0), at(-500.0, 9000.0)],
             timing_ms: Timing::default(),
             model: String::new(),

@@ -3,7 +3,7 @@
 use geometry::{Base, Camera, Point};
 use serde::{Deserialize, Serialize};
 
-use crate::{Cue, Detections, Drive, Screw, Timing, Verdict};
+use crate::{Cue, Detections, Doubt, Drive, Screw, Timing, Verdict};
 
 /// Where a find lies against the calibrated volume.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -43,6 +43,9 @@ pub struct ImageReport {
     pub model: String,
     /// The finds.
     pub screws: Vec<ScrewReport>,
+    /// Why nothing in the picture is to be acted on; empty where it can be trusted.
+    #[serde(default)]
+    pub doubts: Vec<Doubt>,
     /// Time spent, ms.
     pub timing_ms: Timing,
 }
@@ -124,6 +127,7 @@ impl Detections {
                     }
                 })
                 .collect(),
+            doubts: self.doubts.clone(),
             timing_ms: Timing {
                 decode: rounded(t.decode, 1),
                 coarse: rounded(t.coarse, 1),
@@ -175,6 +179,7 @@ mod tests {
         };
         let detections = Detections {
             screws: vec![screw, flat],
+            doubts: Vec::new(),
             timing_ms: Timing::default(),
             model: "sha256:00".into(),
             size_px: (4104, 3006),
@@ -194,7 +199,7 @@ mod tests {
             r#""hull":"inside","cues":["learned","cross"],"angle_rad":null},"#,
             r#"{"u_px":1323.9,"v_px":897.5,"sigma_px":0.2,"diameter_px":37.4,"score":0.998,"drive":"hex_socket","verdict":"other","#,
             r#""camera_mm":null,"base_mm":null,"sigma_lateral_mm":null,"sigma_depth_mm":null,"#,
-            r#""hull":null,"cues":["learned","cross"],"angle_rad":null}],"#,
+            r#""hull":null,"cues":["learned","cross"],"angle_rad":null}],"doubts":[],"#,
             r#""timing_ms":{"decode":0.0,"coarse":0.0,"fine":0.0,"centre":0.0,"locate":0.0,"total":0.0}}"#
         );
         let line = serde_json::to_string(&report)?;

@@ -318,6 +318,7 @@ mod tests {
 
     pub(super) fn detections(screws: Vec<Screw>) -> Detections {
         Detections {
+            doubts: Vec::new(),
             screws,
             timing_ms: Timing::default(),
             model: "sha256:00".into(),
