@@ -74,14 +74,19 @@ fn photographs(from: &Path, to: &Path) -> Result<(), Box<dyn Error>> {
         }
         let stem = file.strip_suffix(".jpg").ok_or("expected JPEG files")?;
         let name = format!("{scene}_{count}");
-        fs::copy(from.join("images").join(file), to.join(format!("{name}.jpg")))?;
-        fs::copy(
-            from.join("labels").join(format!("{stem}.txt")),
-            to.join(format!("{name}.txt")),
-        )?;
+        for (folder, from_file, extension) in [
+            ("images", file.to_owned(), "jpg"),
+            ("labels", format!("{stem}.txt"), "txt"),
+        ] {
+            fs::create_dir_all(to.join(folder))?;
+            fs::copy(
+                from.join(folder).join(from_file),
+                to.join(folder).join(format!("{name}.{extension}")),
+            )?;
+        }
         index.push_str(&format!("{name}.jpg,{scene}\n"));
         *count += 1;
     }
-    fs::write(to.join("index.csv"), index)?;
+    fs::write(to.join("manifest.csv"), index)?;
     Ok(())
 }

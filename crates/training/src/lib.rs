@@ -5,6 +5,7 @@
 //! exact truth, `nn` to learn, `vision` for what the networks see and say.
 
 mod batch;
+mod boxes;
 mod evaluate;
 mod face;
 mod pictures;
@@ -14,10 +15,11 @@ mod train;
 mod trial;
 mod tune;
 
+pub use boxes::BoxesError;
 pub use evaluate::{
     Coverage, CropEvaluation, CurvePoint, DecoyRow, DriveRow, EvaluateError, Evaluation, Evaluator,
     FIRST_EVALUATION_SEED, FalseFind, Miss, PhotoEvaluation, Product, Quantiles, ReliabilityBin, SceneRow, StageOne,
-    evaluate_crops, evaluate_faces, evaluate_truth_folder, evaluate_yolo_folder, truth_files,
+    evaluate_crops, evaluate_faces, evaluate_photographs, evaluate_truth_folder, truth_files,
 };
 pub use face::drive_seen;
 pub use geometry::{Rate, wilson};

@@ -1,6 +1,7 @@
 //! Real photographs as patches: e-waste crops and photographs of appliances, carried in `crates/training/data`.
 
 use crate::TrainError;
+use crate::boxes::{BoxKind, DrawnBox, boxed_pictures};
 use crate::samples::{Classes, Label, PATCH_PX, Patch, any_fastener, only};
 use geometry::{RgbImage, read_color};
 use image::imageops::{self, FilterType};
@@ -91,16 +92,16 @@ fn place(crop: &RgbImage, head_px: f64, classes: Classes, elsewhere: Classes) ->
 }
 
 fn photographs(folder: &Path, rng: &mut Pcg64Mcg) -> Result<Vec<Patch>, TrainError> {
-    let index = text(&folder.join("index.csv"))?;
     let mut patches = Vec::new();
-    for line in index.lines().skip(1) {
-        let Some((file, scene)) = line.split_once(',') else {
-            continue;
-        };
-        let picture = read_color(&folder.join(file))?;
-        let boxes = boxes(&text(&folder.join(file.replace(".jpg", ".txt")))?, picture.dimensions());
+    for photograph in boxed_pictures(folder)? {
+        let picture = read_color(&photograph.path)?;
+        let boxes: Vec<Labelled> = photograph
+            .boxes(picture.dimensions())
+            .into_iter()
+            .map(Labelled::from)
+            .collect();
         // not everything that turns is labelled on the hard drives: their background teaches nothing
-        let elsewhere = if scene.starts_with("harddrive") {
+        let elsewhere = if photograph.scene.starts_with("harddrive") {
             0
         } else {
             only(Class::Background) | only(Class::OtherFeature)
@@ -141,36 +142,20 @@ struct Labelled {
     classes: Classes,
 }
 
-/// YOLO labels, boxes or polygons: 0 hexagon (socket or head), 1 Phillips.
-fn boxes(text: &str, (width, height): (u32, u32)) -> Vec<Labelled> {
-    let parse = |line: &str| {
-        let v: Vec<f64> = line.split_whitespace().filter_map(|f| f.parse().ok()).collect();
-        let (class, outline) = v.split_first()?;
-        let [x, y, w, h] = match outline {
-            &[x, y, w, h] => [x, y, w, h],
-            corners if corners.len() >= 6 && corners.len() % 2 == 0 => {
-                let extent = |first: usize| {
-                    let along = corners.iter().skip(first).step_by(2);
-                    along.fold([f64::MAX, f64::MIN], |[low, high], &c| [low.min(c), high.max(c)])
-                };
-                let ([left, right], [top, bottom]) = (extent(0), extent(1));
-                [(left + right) / 2.0, (top + bottom) / 2.0, right - left, bottom - top]
-            }
-            _ => return None,
-        };
-        let (w, h) = (w * f64::from(width), h * f64::from(height));
-        Some(Labelled {
-            u_px: x * f64::from(width) - 0.5,
-            v_px: y * f64::from(height) - 0.5,
-            diameter_px: (w * h).sqrt(),
-            classes: if *class == 1.0 {
-                only(Class::Cross)
-            } else {
-                only(Class::HexSocket) | only(Class::HexHead) | only(Class::Torx)
+impl From<DrawnBox> for Labelled {
+    fn from(DrawnBox { kind, low, high }: DrawnBox) -> Self {
+        Self {
+            u_px: 0.5 * (low[0] + high[0]),
+            v_px: 0.5 * (low[1] + high[1]),
+            diameter_px: ((high[0] - low[0]) * (high[1] - low[1])).sqrt(),
+            classes: match kind {
+                BoxKind::Cross => only(Class::Cross),
+                // of the hexagons of the photographs it is not said which
+                BoxKind::Other => only(Class::HexSocket) | only(Class::HexHead) | only(Class::Torx),
+                BoxKind::Hidden => 0,
             },
-        })
-    };
-    text.lines().filter_map(parse).collect()
+        }
+    }
 }
 
 fn cut(picture: &RgbImage, boxes: &[Labelled], at: [f64; 2], scale: f64, elsewhere: Classes, focused: bool) -> Patch {
@@ -226,17 +211,6 @@ fn text(path: &Path) -> Result<String, TrainError> {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn boxes_and_polygons() {
-        let labels = boxes(
-            "1 0.5 0.25 0.1 0.1\n0 0.4 0.4 0.6 0.4 0.6 0.5 0.4 0.5\n\n1 0.5\n",
-            (200, 100),
-        );
-        assert_eq!(labels.len(), 2);
-        assert!((labels[0].u_px - 99.5).abs() < 1e-9 && labels[0].classes == only(Class::Cross));
-        assert!((labels[1].v_px - 44.5).abs() < 1e-9 && (labels[1].diameter_px - (40.0f64 * 10.0).sqrt()).abs() < 1e-9);
-    }
 
     #[test]
     fn a_group_is_on_one_side() {

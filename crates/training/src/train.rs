@@ -1,6 +1,7 @@
 //! Training: patches, a network a stage, thresholds, one model file; the same bytes from the same settings on any number of threads.
 
 use crate::batch::{Batch, Stage, batch, loss};
+use crate::boxes::BoxesError;
 use crate::pictures;
 use crate::real;
 use crate::samples::{Patch, any_fastener, only, rendered};
@@ -59,6 +60,9 @@ pub enum TrainError {
     /// A picture or the model file.
     #[error(transparent)]
     File(#[from] geometry::FileError),
+    /// Photographs with boxes.
+    #[error(transparent)]
+    Boxes(#[from] BoxesError),
     /// A network could not be saved.
     #[error(transparent)]
     Network(#[from] nn::NnError),

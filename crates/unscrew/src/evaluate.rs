@@ -12,7 +12,7 @@ use std::{
     sync::atomic::Ordering,
 };
 use training::{
-    EvaluateError, Evaluator, FIRST_EVALUATION_SEED, Product, evaluate_crops, evaluate_yolo_folder, truth_files,
+    EvaluateError, Evaluator, FIRST_EVALUATION_SEED, Product, evaluate_crops, evaluate_photographs, truth_files,
 };
 use vision::{Detector, Options};
 
@@ -37,7 +37,7 @@ pub struct Args {
     /// Folder with rgb/*.jpg, depth/*.png and truth/*.json, instead of rendered faces
     #[arg(long, value_name = "DIR", conflicts_with_all = ["faces", "seed", "photos"])]
     truth: Option<PathBuf>,
-    /// Folder with images/, labels/ (YOLO, class 1: cross recess, 0: hexagon) and manifest.csv (file, scene), instead of rendered faces
+    /// Folder of photographs with boxes (COCO, YOLO or Pascal VOC), perhaps with manifest.csv (file, scene), instead of rendered faces
     #[arg(long, value_name = "DIR", conflicts_with_all = ["faces", "seed"])]
     photos: Option<PathBuf>,
     /// Folder of the training data with ewaste.csv and ewaste_*.jpg, for its held-out crops, instead of rendered faces
@@ -91,12 +91,10 @@ pub fn run(args: &Args) -> Result<Ended> {
     };
     if let Some(folder) = &args.photos {
         let bar = output::progress(0, "photographs");
-        let evaluation = evaluate_yolo_folder(
+        let evaluation = evaluate_photographs(
             &detector,
             &options,
-            &folder.join("images"),
-            &folder.join("labels"),
-            &folder.join("manifest.csv"),
+            folder,
             (!args.scene.is_empty()).then_some(args.scene.as_slice()),
             &|done, all| {
                 bar.set_length(all);

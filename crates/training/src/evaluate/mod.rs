@@ -1,7 +1,7 @@
 //! What a detector is worth: its finds beside the truth, as rates with bounds.
 //!
 //! Four sources of truth: rendered faces that training never saw ([`evaluate_faces`]), a folder of pictures with exact truth from
-//! anywhere ([`evaluate_truth_folder`]), photographs with boxes drawn by people ([`evaluate_yolo_folder`]), and crops of e-waste
+//! anywhere ([`evaluate_truth_folder`]), photographs with boxes drawn by people ([`evaluate_photographs`]), and crops of e-waste
 //! that training left out ([`evaluate_crops`]).
 
 mod crops;
@@ -14,7 +14,7 @@ pub use faces::{
     DecoyRow, DriveRow, Evaluation, Evaluator, FIRST_EVALUATION_SEED, Product, StageOne, evaluate_faces,
     evaluate_truth_folder, truth_files,
 };
-pub use photographs::{PhotoEvaluation, SceneRow, evaluate_yolo_folder};
+pub use photographs::{PhotoEvaluation, SceneRow, evaluate_photographs};
 pub use scores::{CurvePoint, ReliabilityBin};
 
 use std::fmt::{self, Formatter};
@@ -24,6 +24,7 @@ use geometry::{FileError, Pixel, Rate};
 use serde::{Deserialize, Serialize};
 use vision::{Screw, Verdict};
 
+use crate::boxes::BoxesError;
 use crate::train::TrainError;
 
 /// Misses and false finds that are listed one by one.
@@ -53,6 +54,9 @@ pub enum EvaluateError {
         /// What is wrong and what is expected.
         reason: String,
     },
+    /// Pictures with boxes.
+    #[error(transparent)]
+    Boxes(#[from] BoxesError),
     /// The training data's folder.
     #[error(transparent)]
     Data(#[from] TrainError),

@@ -1,4 +1,4 @@
-//! Photographs with boxes in YOLO's format.
+//! Photographs with boxes drawn by people.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::{self, Display, Formatter};
@@ -8,7 +8,8 @@ use geometry::{Pixel, Rate, read_color, wilson_share};
 use serde::{Deserialize, Serialize};
 use vision::{Detections, Detector, Options, Screw, Verdict};
 
-use super::{EvaluateError, FalseFind, Miss, Share, cut, list, percent, read_text, speaker, write_lists};
+use super::{EvaluateError, FalseFind, Miss, Share, cut, list, percent, speaker, write_lists};
+use crate::boxes::{BoxKind, DrawnBox, boxed_pictures};
 
 /// A find and a person's box are the same thing from this overlap on (intersection over union).
 const SAME_BOX: f64 = 0.3;
@@ -53,11 +54,11 @@ pub struct PhotoEvaluation {
     pub false_finds: usize,
     /// The same a photograph.
     pub false_finds_mean: f64,
-    /// Of these, on a labelled hexagon.
-    pub hex_called_screw: usize,
-    /// Labelled hexagons.
-    pub hexagons: usize,
-    /// Drive that reported labels were given: by label (`cross`, `hex`), then by drive.
+    /// Of these, on another labelled fastener.
+    pub other_called_screw: usize,
+    /// Other labelled fasteners.
+    pub others: usize,
+    /// Drive that reported labels were given: by label (`cross`, `other`), then by drive.
     pub drives: BTreeMap<String, BTreeMap<String, usize>>,
     /// By scene.
     pub scenes: BTreeMap<String, SceneRow>,
@@ -69,15 +70,7 @@ pub struct PhotoEvaluation {
     pub total_ms: f64,
 }
 
-/// A box drawn by a person, px.
-#[derive(Clone, Copy, Debug, PartialEq)]
-struct Label {
-    cross: bool,
-    low: [f64; 2],
-    high: [f64; 2],
-}
-
-impl Label {
+impl DrawnBox {
     fn center(&self) -> Pixel {
         Pixel::new(0.5 * (self.low[0] + self.high[0]), 0.5 * (self.low[1] + self.high[1]))
     }
@@ -98,129 +91,49 @@ impl Label {
     }
 }
 
-/// Lines of `class x y w h`, or `class x1 y1 x2 y2 x3 y3 ...` (a polygon), as shares of the picture's size.
-fn parse_labels(text: &str, size_px: (u32, u32)) -> Result<Vec<Label>, String> {
-    let size = [f64::from(size_px.0), f64::from(size_px.1)];
-    let mut labels = Vec::new();
-    for (line, number) in text.lines().zip(1..) {
-        let fields: Vec<&str> = line.split_whitespace().collect();
-        let [class, numbers @ ..] = fields.as_slice() else {
-            continue;
-        };
-        let cross = match *class {
-            "0" => false,
-            "1" => true,
-            other => {
-                return Err(format!(
-                    "line {number}: class {other}; expected 0 (hexagon) or 1 (cross)"
-                ));
-            }
-        };
-        let finite = |n: &&str| n.parse().ok().filter(|v: &f64| v.is_finite());
-        let values: Option<Vec<f64>> = numbers.iter().map(finite).collect();
-        let values = values.ok_or_else(|| format!("line {number}: expected numbers after the class"))?;
-        let (low, high) = match values.as_slice() {
-            [x, y, w, h] => ([x - 0.5 * w, y - 0.5 * h], [x + 0.5 * w, y + 0.5 * h]),
-            corners if corners.len() >= 6 && corners.len() % 2 == 0 => {
-                let each = |k: usize| corners.iter().skip(k).step_by(2).copied();
-                (
-                    [0, 1].map(|k| each(k).fold(f64::MAX, f64::min)),
-                    [0, 1].map(|k| each(k).fold(f64::MIN, f64::max)),
-                )
-            }
-            _ => {
-                let n = values.len();
-                return Err(format!(
-                    "line {number}: {n} numbers after the class; expected a box of 4 or a polygon"
-                ));
-            }
-        };
-        // shares are of areas: their 0 is the outer edge of pixel 0
-        let to_px = |share: [f64; 2]| [0, 1].map(|k| share[k] * size[k] - 0.5);
-        labels.push(Label {
-            cross,
-            low: to_px(low),
-            high: to_px(high),
-        });
-    }
-    Ok(labels)
-}
-
-/// The columns `file` and `scene` of a manifest.
-fn parse_manifest(text: &str) -> Result<Vec<(String, String)>, String> {
-    let mut lines = text.lines().zip(1..);
-    let fields = |line: &str| -> Vec<String> { line.split(',').map(|f| f.trim().to_owned()).collect() };
-    let header = lines.next().map(|(line, _)| fields(line)).unwrap_or_default();
-    let column = |name: &str| {
-        let place = header.iter().position(|h| h == name);
-        place.ok_or_else(|| format!("no column {name}; expected a CSV file with the columns file and scene"))
-    };
-    let (file, scene) = (column("file")?, column("scene")?);
-    let mut rows = Vec::new();
-    for (line, number) in lines.filter(|(l, _)| !l.trim().is_empty()) {
-        let row = fields(line);
-        if row.len() != header.len() {
-            return Err(format!(
-                "line {number} has {} fields, its header {}; names must not hold commas",
-                row.len(),
-                header.len()
-            ));
-        }
-        rows.push((row[file].clone(), row[scene].clone()));
-    }
-    Ok(rows)
-}
-
-/// Measures a detector on photographs with boxes in YOLO's format, class 1 a cross recess, 0 a hexagon.
+/// Measures a detector on a folder of photographs with boxes drawn by people: COCO, YOLO or Pascal VOC (see `boxes.rs`).
 ///
 /// Many photographs may be photometric copies of one another: figures are per scene first.
 ///
 /// # Arguments
-/// * `manifest` – CSV with the columns `file` (in `images`) and `scene`.
 /// * `scenes` – only these; `None`: all.
 /// * `progress` – told the number of photographs done, and of all.
 ///
 /// # Errors
 /// An [`EvaluateError`] that names the file.
-pub fn evaluate_yolo_folder(
+pub fn evaluate_photographs(
     detector: &Detector,
     options: &Options,
-    images: &Path,
-    labels: &Path,
-    manifest: &Path,
+    folder: &Path,
     scenes: Option<&[String]>,
     progress: &(dyn Fn(u64, u64) + Sync),
 ) -> Result<PhotoEvaluation, EvaluateError> {
-    let format = |path: &Path, reason: String| EvaluateError::Format {
-        path: path.into(),
-        reason,
-    };
-    let mut rows = parse_manifest(&read_text(manifest)?).map_err(|reason| format(manifest, reason))?;
+    let mut photographs = boxed_pictures(folder)?;
     if let Some(wanted) = scenes {
-        let known: BTreeSet<&str> = rows.iter().map(|(_, scene)| scene.as_str()).collect();
+        let known: BTreeSet<&str> = photographs.iter().map(|p| p.scene.as_str()).collect();
         if let Some(unknown) = wanted.iter().find(|w| !known.contains(w.as_str())) {
             let known: Vec<&str> = known.into_iter().collect();
-            let reason = format!("no scene {unknown}; there are {}", known.join(", "));
-            return Err(format(manifest, reason));
+            return Err(EvaluateError::Format {
+                path: folder.into(),
+                reason: format!("no scene {unknown}; there are {}", known.join(", ")),
+            });
         }
-        rows.retain(|(_, scene)| wanted.contains(scene));
-    }
-    if rows.is_empty() {
-        return Err(EvaluateError::Nothing {
-            path: manifest.into(),
-            reason: "it lists no photograph".into(),
-        });
+        photographs.retain(|p| wanted.contains(&p.scene));
     }
     let mut tally = PhotoTally::default();
-    for ((file, scene), done) in rows.iter().zip(1..) {
-        let picture = read_color(&images.join(file))?;
-        let path = labels.join(Path::new(file).with_extension("txt"));
-        let labels = parse_labels(&read_text(&path)?, picture.dimensions()).map_err(|reason| format(&path, reason))?;
-        tally.add(file, scene, &labels, &detector.detect_image(&picture, options));
-        progress(done, rows.len() as u64);
+    for (photograph, done) in photographs.iter().zip(1..) {
+        let picture = read_color(&photograph.path)?;
+        let found = detector.detect_image(&picture, options);
+        tally.add(
+            &photograph.name,
+            &photograph.scene,
+            &photograph.boxes(picture.dimensions()),
+            &found,
+        );
+        progress(done, photographs.len() as u64);
     }
     let head_px = [*options.head_px.start(), *options.head_px.end()];
-    let source = format!("photographs of {}", images.display());
+    let source = format!("photographs of {}", folder.display());
     Ok(tally.finish(source, detector.model().id(), head_px))
 }
 
@@ -230,9 +143,9 @@ struct PhotoTally {
     recall: Share,
     review: usize,
     any: usize,
-    hexagons: usize,
+    others: usize,
     false_finds: usize,
-    hex_called_screw: usize,
+    other_called_screw: usize,
     drives: BTreeMap<String, BTreeMap<String, usize>>,
     /// By scene: found and labelled cross screws, and false finds, of each photograph.
     scenes: BTreeMap<String, Vec<(Share, usize)>>,
@@ -242,12 +155,12 @@ struct PhotoTally {
 }
 
 impl PhotoTally {
-    fn add(&mut self, file: &str, scene: &str, labels: &[Label], found: &Detections) {
+    fn add(&mut self, file: &str, scene: &str, labels: &[DrawnBox], found: &Detections) {
         self.photos += 1;
         self.total_ms += found.timing_ms.total;
         // a find belongs to the nearest box that holds it, so that one find cannot stand for two screws
         let owner = |find: &Screw| {
-            let far = |l: &Label| l.center().distance_px(&find.pixel);
+            let far = |l: &DrawnBox| l.center().distance_px(&find.pixel);
             let held = labels.iter().enumerate().filter(|(_, l)| l.holds(find));
             held.min_by(|a, b| far(a.1).total_cmp(&far(b.1))).map(|(k, _)| k)
         };
@@ -257,13 +170,18 @@ impl PhotoTally {
             let finds = found.screws.iter().zip(&owners);
             let own = finds.filter(|(_, o)| **o == Some(k)).map(|(find, _)| find);
             let find = speaker(own, label.center());
+            let cross = match label.kind {
+                BoxKind::Cross => true,
+                BoxKind::Other => false,
+                BoxKind::Hidden => continue,
+            };
             if let Some(find) = find {
-                let name = if label.cross { "cross" } else { "hex" };
+                let name = if cross { "cross" } else { "other" };
                 let drives = self.drives.entry(name.into()).or_default();
                 *drives.entry(find.drive.name().into()).or_default() += 1;
             }
-            if !label.cross {
-                self.hexagons += 1;
+            if !cross {
+                self.others += 1;
                 continue;
             }
             let hit = find.is_some_and(|f| f.verdict == Verdict::Screw);
@@ -279,13 +197,13 @@ impl PhotoTally {
             }
         }
         for find in found.screws.iter().filter(|f| f.verdict == Verdict::Screw) {
-            if labels.iter().any(|l| l.cross && l.holds(find)) {
+            if labels.iter().any(|l| l.kind != BoxKind::Other && l.holds(find)) {
                 continue;
             }
-            let hex = labels.iter().any(|l| l.holds(find));
+            let other = labels.iter().any(|l| l.holds(find));
             false_finds += 1;
-            self.hex_called_screw += usize::from(hex);
-            let kind = if hex { "hex" } else { "background" };
+            self.other_called_screw += usize::from(other);
+            let kind = if other { "other" } else { "background" };
             list(&mut self.false_list, || FalseFind::new(file, find, kind));
         }
         self.false_finds += false_finds;
@@ -321,8 +239,8 @@ impl PhotoTally {
             recall_any: Rate::of(self.any, self.recall.of),
             false_finds: self.false_finds,
             false_finds_mean: self.false_finds as f64 / n,
-            hex_called_screw: self.hex_called_screw,
-            hexagons: self.hexagons,
+            other_called_screw: self.other_called_screw,
+            others: self.others,
             drives: self.drives,
             scenes,
             misses: self.misses,
@@ -353,8 +271,8 @@ impl Display for PhotoEvaluation {
         writeln!(f, "  any      {}", self.recall_any)?;
         writeln!(
             f,
-            "false        {} finds, {:.2} a photograph; {} of them on one of {} hexagons",
-            self.false_finds, self.false_finds_mean, self.hex_called_screw, self.hexagons
+            "false        {} finds, {:.2} a photograph; {} of them on one of {} other fasteners",
+            self.false_finds, self.false_finds_mean, self.other_called_screw, self.others
         )?;
         if !self.drives.is_empty() {
             writeln!(f, "\nlabel    drive it was given")?;
@@ -390,48 +308,45 @@ mod tests {
 
     #[test]
     fn photographs_are_counted_by_scene() {
-        let text = "1 0.1 0.1 0.05 0.05\n\n0 0.5 0.5 0.6 0.5 0.6 0.6 0.5 0.6\n";
-        let labels = parse_labels(text, (1000, 1000)).expect("a box and a polygon");
-        let near = |a: [f64; 2], b: f64| a.iter().all(|a| (a - b).abs() < 1e-9);
-        assert!(labels[0].cross && near(labels[0].low, 74.5) && near(labels[0].high, 124.5));
-        assert!(!labels[1].cross && near(labels[1].low, 499.5) && near(labels[1].high, 599.5));
-        assert!(parse_labels("2 0 0 1 1", (9, 9)).is_err() && parse_labels("1 0 0 1", (9, 9)).is_err());
+        let drawn = |kind, low: f64, high: f64| DrawnBox {
+            kind,
+            low: [low; 2],
+            high: [high; 2],
+        };
+        let labels = [
+            drawn(BoxKind::Cross, 74.5, 124.5),
+            drawn(BoxKind::Other, 499.5, 599.5),
+            drawn(BoxKind::Hidden, 895.0, 925.0),
+        ];
 
         let acted = |at: f64| find(at, at, Verdict::Screw, Drive::Cross);
         let mut tally = PhotoTally::default();
-        tally.add("a", "one", &labels, &detections(vec![acted(100.0), acted(550.0)]));
+        tally.add(
+            "a",
+            "one",
+            &labels,
+            &detections(vec![acted(100.0), acted(550.0), acted(910.0)]),
+        );
         let bolt = find(550.0, 550.0, Verdict::Other, Drive::HexHead);
         tally.add("b", "one", &labels, &detections(vec![bolt]));
-        let second = Label {
-            cross: true,
-            low: [200.0; 2],
-            high: [230.0; 2],
-        };
+        let second = drawn(BoxKind::Cross, 200.0, 230.0);
         let finds = vec![acted(100.0), acted(216.0), acted(800.0)];
         tally.add("c", "two", &[labels[0], second], &detections(finds));
         let e = tally.finish("x".into(), "sha256:00", [15.0, 80.0]);
-        assert_eq!((e.distinct, e.photos, e.hexagons), (3, 3, 2));
+        assert_eq!((e.distinct, e.photos, e.others), (3, 3, 2));
         // scene one: half of one screw; scene two: both of two
         assert!((e.recall_distinct.expect("screws") - 2.5 / 3.0).abs() < 1e-12, "{e:?}");
         assert_eq!((e.recall.hits, e.recall.of), (3, 4));
         assert_eq!(
-            (e.false_finds, e.hex_called_screw, e.false_finds_mean),
+            (e.false_finds, e.other_called_screw, e.false_finds_mean),
             (2, 1, 2.0 / 3.0)
         );
-        assert_eq!((e.drives["hex"]["cross"], e.drives["hex"]["hex_head"]), (1, 1));
+        assert_eq!((e.drives["other"]["cross"], e.drives["other"]["hex_head"]), (1, 1));
         assert_eq!(e.drives["cross"]["cross"], 3);
         assert!(e.to_string().lines().all(|l| l.chars().count() <= 100), "{e}");
 
         // a centre outside the box: a good overlap serves, too little of one does not
         let at = |u_px: f64| find(u_px, 215.0, Verdict::Screw, Drive::Cross);
         assert!(second.holds(&at(199.0)) && !second.holds(&at(192.0)));
-    }
-
-    #[test]
-    fn manifests() {
-        let rows = parse_manifest("scene,file,n\ns1,a.jpg,3\n\ns2,b.jpg,4\n").expect("two rows");
-        assert_eq!(rows[1], ("b.jpg".into(), "s2".into()));
-        assert!(parse_manifest("file,n\n").is_err_and(|e| e.contains("scene")));
-        assert!(parse_manifest("file,scene\na,b,c\n").is_err_and(|e| e.contains("line 2")));
     }
 }
