@@ -57,4 +57,7 @@ pub enum NnError {
         "the tensor `{0}` of the network file has values that are not finite: the training diverged; lower its learning rate and train again"
     )]
     NotFinite(String),
+    /// An ONNX model that is not one chain of the layers that can be run.
+    #[error("the ONNX model cannot be used: {0}")]
+    Onnx(String),
 }

@@ -116,16 +116,14 @@ pub fn boxed_pictures(folder: &Path) -> Result<Vec<BoxedPicture>, BoxesError> {
     let manifest = folder.join("manifest.csv");
     if manifest.is_file() {
         let rows = parse_manifest(&read(&manifest)?).map_err(|reason| malformed(&manifest, reason))?;
-        pictures.retain_mut(|p| match rows.get(&p.name) {
-            Some(scene) => {
-                p.scene.clone_from(scene);
-                true
-            }
-            None => false,
-        });
-        if let Some(missing) = rows.keys().find(|name| !pictures.iter().any(|p| p.name == **name)) {
-            return Err(malformed(&manifest, format!("there are no boxes for {missing}")));
-        }
+        let mut known: BTreeMap<String, BoxedPicture> = pictures.into_iter().map(|p| (p.name.clone(), p)).collect();
+        pictures = rows
+            .into_iter()
+            .map(|(name, scene)| match known.remove(&name) {
+                Some(picture) => Ok(BoxedPicture { scene, ..picture }),
+                None => Err(malformed(&manifest, format!("there are no boxes for {name}"))),
+            })
+            .collect::<Result<_, _>>()?;
     }
     if pictures.is_empty() {
         return Err(BoxesError::Nothing { path: folder.into() });
@@ -379,8 +377,8 @@ fn voc_pictures(folder: &Path) -> Result<Vec<BoxedPicture>, BoxesError> {
         .collect()
 }
 
-/// Scene by file, from the columns `file` and `scene` of a manifest.
-fn parse_manifest(text: &str) -> Result<BTreeMap<String, String>, String> {
+/// Files and their scenes, from the columns `file` and `scene` of a manifest.
+fn parse_manifest(text: &str) -> Result<Vec<(String, String)>, String> {
     let mut lines = text.lines().zip(1..);
     let fields = |line: &str| -> Vec<String> { line.split(',').map(|f| f.trim().to_owned()).collect() };
     let header = lines.next().map(|(line, _)| fields(line)).unwrap_or_default();
@@ -389,7 +387,7 @@ fn parse_manifest(text: &str) -> Result<BTreeMap<String, String>, String> {
         place.ok_or_else(|| format!("no column {name}; expected a CSV file with the columns file and scene"))
     };
     let (file, scene) = (column("file")?, column("scene")?);
-    let mut rows = BTreeMap::new();
+    let mut rows = Vec::new();
     for (line, number) in lines.filter(|(l, _)| !l.trim().is_empty()) {
         let row = fields(line);
         if row.len() != header.len() {
@@ -399,7 +397,7 @@ fn parse_manifest(text: &str) -> Result<BTreeMap<String, String>, String> {
                 header.len()
             ));
         }
-        rows.insert(row[file].clone(), row[scene].clone());
+        rows.push((row[file].clone(), row[scene].clone()));
     }
     Ok(rows)
 }
@@ -412,7 +410,7 @@ mod tests {
     #[test]
     fn manifests() {
         let rows = parse_manifest("scene,file,n\ns1,a.jpg,3\n\ns2,b.jpg,4\n").expect("two rows");
-        assert_eq!(rows["b.jpg"], "s2");
+        assert_eq!(rows[1], ("b.jpg".into(), "s2".into()));
         assert!(parse_manifest("file,n\n").is_err_and(|e| e.contains("scene")));
         assert!(parse_manifest("file,scene\na,b,c\n").is_err_and(|e| e.contains("line 2")));
     }

@@ -11,6 +11,7 @@ mod face;
 mod pictures;
 mod real;
 mod samples;
+mod sheet;
 mod train;
 mod trial;
 mod tune;
@@ -23,6 +24,7 @@ pub use evaluate::{
 };
 pub use face::drive_seen;
 pub use geometry::{Rate, wilson};
+pub use sheet::crop_sheet;
 pub use train::{Progress, TRAINING_SEEDS, TUNING_SEEDS, TrainError, TrainReport, TrainSettings, train};
-pub use trial::{Trial, measure_networks, try_network};
+pub use trial::{Trial, measure_networks, measure_networks_on_pictures, try_network};
 pub use tune::Tuning;

@@ -1,4 +1,4 @@
-//! Training: patches, a network a stage, thresholds, one model file; the same bytes from the same settings on any number of threads.
+//! Training: patches, four networks, thresholds, one model file; the same bytes from the same settings on any number of threads.
 
 use crate::batch::{Batch, Stage, batch, loss};
 use crate::boxes::BoxesError;
@@ -6,7 +6,7 @@ use crate::pictures;
 use crate::real;
 use crate::samples::{Patch, any_fastener, only, rendered};
 use crate::tune::{self, Tuning};
-use nn::{Spec, Tensor, Trainer};
+use nn::{Tensor, Trainer};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use serde::Serialize;
@@ -19,6 +19,8 @@ use std::{
 use vision::layout::{Class, coarse_spec, fine_spec};
 use vision::{Detector, Settings, Thresholds, decode_model, encode_model};
 
+/// Networks in the ensemble of stage 2, as in the paper.
+const ENSEMBLE: u64 = 3;
 /// Units below this seed are learned from.
 pub const TRAINING_SEEDS: Range<u64> = 0..500_000;
 /// Units whose faces set thresholds and sigma factors.
@@ -100,8 +102,10 @@ pub struct TrainSettings {
     pub learning_rate: f32,
     /// Steps of stage 1.
     pub coarse_steps: usize,
-    /// Steps of stage 2.
+    /// Steps of each network of stage 2, those that they share included.
     pub fine_steps: usize,
+    /// The first steps, which the networks of stage 2 share.
+    pub shared_steps: usize,
     /// Faces that set thresholds and sigma factors.
     pub tuning_faces: u64,
     /// Seed of everything.
@@ -136,6 +140,7 @@ impl Default for TrainSettings {
             learning_rate: 0.01,
             coarse_steps: 1900,
             fine_steps: 11000,
+            shared_steps: 9500,
             tuning_faces: 150,
             seed: 1,
             from: None,
@@ -206,16 +211,30 @@ pub fn train(settings: &TrainSettings, out: &Path, progress: &dyn Progress) -> R
         progress,
     };
     let mut losses = BTreeMap::new();
-    let mut learned = |name: &str, kept: &str, spec: Spec, stage: Stage, seed: u64| {
-        let trainer = match start.get(kept) {
-            Some(bytes) => Trainer::from_bytes(bytes)?,
-            None => Trainer::new(spec, seed),
-        };
-        let trainer = lesson.learn(name, trainer, stage, &mut losses)?;
-        Ok::<_, TrainError>(trainer.to_bytes(&BTreeMap::new())?)
+    let coarse = match start.get("coarse") {
+        Some(bytes) => Trainer::from_bytes(bytes)?,
+        None => Trainer::new(coarse_spec(), settings.seed),
     };
-    let coarse = learned("coarse", "coarse", coarse_spec(), Stage::Coarse, settings.seed)?;
-    let fine = [learned("fine", "fine0", fine_spec(), Stage::Fine, settings.seed + 1)?];
+    let coarse = lesson.learn("coarse", coarse, Stage::Coarse, settings.coarse_steps, &mut losses)?;
+    // the members of the ensemble share their first steps, then each goes its own way
+    let shared = if settings.from.is_some() {
+        0
+    } else {
+        settings.shared_steps
+    };
+    let trunk = Trainer::new(fine_spec(), settings.seed + 1);
+    let trunk = lesson.learn("shared", trunk, Stage::Fine, shared, &mut losses)?;
+    let mut fine = Vec::new();
+    for k in 0..ENSEMBLE {
+        let name = format!("fine{k}");
+        let trainer = match start.get(&name) {
+            Some(bytes) => Trainer::from_bytes(bytes)?,
+            None => trunk.clone(),
+        };
+        let trainer = lesson.learn(&name, trainer, Stage::Fine, settings.fine_steps, &mut losses)?;
+        fine.push(trainer.to_bytes(&BTreeMap::new())?);
+    }
+    let coarse = coarse.to_bytes(&BTreeMap::new())?;
     drop((patches, pictured));
     let untuned = Settings {
         thresholds: Thresholds::default(),
@@ -356,7 +375,7 @@ pub struct Lesson<'a> {
 }
 
 impl Lesson<'_> {
-    /// Trains from the step where the trainer is up to the last, and puts the loss over the last steps into `losses`.
+    /// Trains from the step where the trainer is up to the `last`, and puts the loss over the last steps into `losses`.
     ///
     /// # Errors
     /// [`TrainError`] for the work folder.
@@ -365,10 +384,11 @@ impl Lesson<'_> {
         name: &str,
         mut trainer: Trainer,
         stage: Stage,
+        last: usize,
         losses: &mut BTreeMap<String, f32>,
     ) -> Result<Trainer, TrainError> {
         let settings = self.settings;
-        let last = match stage {
+        let total = match stage {
             Stage::Coarse => settings.coarse_steps,
             Stage::Fine => settings.fine_steps,
         };
@@ -406,11 +426,11 @@ impl Lesson<'_> {
             let picks = picks(&pools, settings.batch, &mut rng);
             let Batch { input, targets } = batch(stage, &all, &picks, rng.random());
             let output = trainer.forward(&input);
-            let place = if 4 * step >= 3 * last { LATE_PLACE } else { 1.0 };
+            let place = if 4 * step >= 3 * total { LATE_PLACE } else { 1.0 };
             let now = loss(stage, &output, &targets, place, &mut grad);
             trainer.backward(&grad);
             let rise = ((step + 1) as f32 / WARM_UP as f32).min(1.0);
-            let rate = settings.learning_rate * rise * (1.0 - step as f32 / last as f32);
+            let rate = settings.learning_rate * rise * (1.0 - step as f32 / total as f32);
             trainer.adam_step(rate, 0.0);
             mean_loss = if mean_loss.is_nan() {
                 now

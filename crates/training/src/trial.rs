@@ -1,13 +1,13 @@
 //! One network of stage 2, or several, judged on patches alone: quick enough to compare architectures.
 
 use crate::batch::Stage;
-use crate::real;
 use crate::samples::{PATCH_PX, Patch, only, rendered};
 use crate::train::{Lesson, Progress, TUNING_SEEDS, TrainError, TrainSettings};
+use crate::{pictures, real};
 use geometry::{Pixel, RgbImage};
 use nn::{Network, Spec, Trainer};
 use serde::Serialize;
-use std::{collections::BTreeMap, ops::Range, time::Instant};
+use std::{collections::BTreeMap, ops::Range, path::Path, time::Instant};
 use vision::layout::Class;
 
 /// How one architecture of stage 2 does, alone, on patches of units that it did not learn from.
@@ -57,7 +57,7 @@ pub fn try_network(
     let begin = Instant::now();
     let mut losses = BTreeMap::new();
     let start = Trainer::new(spec, settings.seed);
-    let trainer = lesson.learn("trial", start, Stage::Fine, &mut losses)?;
+    let trainer = lesson.learn("trial", start, Stage::Fine, settings.fine_steps, &mut losses)?;
     let train_s = begin.elapsed().as_secs_f64();
     let first = TUNING_SEEDS.start + 100_000;
     let unseen = rendered(first..first + units, settings.background, work, &|_| {})?;
@@ -78,6 +78,15 @@ pub fn measure_networks(
     settings: &TrainSettings,
 ) -> Result<Trial, TrainError> {
     let patches = rendered(units, settings.background, settings.work.as_deref(), &|_| {})?;
+    Ok(judged(networks, &patches))
+}
+
+/// The same on a folder of pictures with exact truth (see `pictures.rs`).
+///
+/// # Errors
+/// [`TrainError`] that names the file.
+pub fn measure_networks_on_pictures(networks: &[Network], folder: &Path) -> Result<Trial, TrainError> {
+    let (patches, _) = pictures::patches(folder, 0)?;
     Ok(judged(networks, &patches))
 }
 

@@ -15,6 +15,7 @@ fn tiny(work: Option<&Path>) -> TrainSettings {
         batch: 8,
         coarse_steps: 4,
         fine_steps: 4,
+        shared_steps: 2,
         tuning_faces: 0,
         work: work.map(Path::to_owned),
         data: Path::new(env!("CARGO_MANIFEST_DIR")).join("data"),
@@ -31,13 +32,13 @@ fn a_training_that_was_stopped_ends_with_the_same_bytes() -> Result<(), Box<dyn 
     let in_one_go = fs::read(&out)?;
     let report = train(&tiny(Some(&work)), &out, &Silent)?;
     assert_eq!(fs::read(&out)?, in_one_go);
-    // as a stop leaves it: stage 2 not begun, one unit's patches not yet written
+    // as a stop leaves it: the third network not begun, one unit's patches not yet written
     let gone: Vec<_> = fs::read_dir(&work)?
         .filter_map(Result::ok)
         .filter(|f| {
             f.file_name()
                 .to_str()
-                .is_some_and(|n| n.starts_with("fine-") || n.ends_with(".patches"))
+                .is_some_and(|n| n.starts_with("fine2") || n.ends_with(".patches"))
         })
         .collect();
     assert_eq!(gone.len(), 2, "{gone:?}");
@@ -48,7 +49,7 @@ fn a_training_that_was_stopped_ends_with_the_same_bytes() -> Result<(), Box<dyn 
     assert_eq!(fs::read(&out)?, in_one_go);
     assert_eq!(again.loss, report.loss);
     assert!(
-        again.loss.len() == 2 && again.loss.values().all(|l| l.is_finite()),
+        again.loss.len() == 5 && again.loss.values().all(|l| l.is_finite()),
         "{:?}",
         again.loss
     );

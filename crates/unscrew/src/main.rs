@@ -10,6 +10,7 @@ mod curve;
 mod detect;
 mod diagnosis;
 mod evaluate;
+mod model;
 mod output;
 mod report;
 mod run;
@@ -46,6 +47,9 @@ enum Command {
     Evaluate(evaluate::Args),
     /// Train the detector's networks and write a model file.
     Train(train::Args),
+    /// Networks to ONNX files and from them.
+    #[command(subcommand)]
+    Model(model::Command),
     /// Render faces of outdoor units with depth and exact truth.
     Synth(synth::Args),
     /// Rates with bounds and times by resource, from a run's journal.
@@ -73,6 +77,7 @@ fn main() -> ExitCode {
         Command::Calibrate(command) => calibrate::run(&command),
         Command::Evaluate(args) => evaluate::run(&args),
         Command::Train(args) => train::run(&args),
+        Command::Model(command) => model::run(&command),
         Command::Synth(args) => synth::run(&args),
         Command::Stats(args) => stats::run(&args),
     };

@@ -10,7 +10,7 @@ use std::{
 };
 use training::{Progress, TrainSettings, train};
 
-/// Trains the detector's two networks from rendered faces and the real photographs in the repository; the same file for the same
+/// Trains the detector's four networks from rendered faces and the real photographs in the repository; the same file for the same
 /// settings. About an hour and a half on 2 cores.
 #[derive(clap::Args)]
 #[command(after_help = "Example: unscrew train --out model.unscrew\nThen:    unscrew evaluate --model model.unscrew")]
@@ -39,9 +39,12 @@ pub struct Args {
     /// Steps of the coarse network
     #[arg(long, default_value_t = TrainSettings::default().coarse_steps)]
     coarse_steps: usize,
-    /// Steps of the fine network
+    /// Steps of each fine network, those that they share included
     #[arg(long, default_value_t = TrainSettings::default().fine_steps)]
     fine_steps: usize,
+    /// First steps, which the fine networks share
+    #[arg(long, default_value_t = TrainSettings::default().shared_steps)]
+    shared_steps: usize,
     /// First learning rate
     #[arg(long, default_value_t = TrainSettings::default().learning_rate)]
     learning_rate: f32,
@@ -94,6 +97,7 @@ pub fn run(args: &Args) -> Result<Ended> {
         units: args.units,
         coarse_steps: args.coarse_steps,
         fine_steps: args.fine_steps,
+        shared_steps: args.shared_steps,
         learning_rate: args.learning_rate,
         tuning_faces: args.tuning_faces,
         seed: args.seed,

@@ -204,6 +204,37 @@ fn fit_and_apply_keep_the_contract() {
 }
 
 #[test]
+fn networks_go_to_onnx_and_come_back() {
+    let dir = folder();
+    let at = dir.path();
+    picture(at.join("a.png"), 200, 150);
+    let exported = unscrew(at, &["model", "export", "--out", "onnx"]);
+    assert!(exported.status.success(), "{exported:?}");
+    let import = [
+        "model",
+        "import",
+        "--coarse",
+        "onnx/coarse.onnx",
+        "--fine",
+        "onnx/fine0.onnx",
+        "--out",
+        "m.unscrew",
+    ];
+    assert!(unscrew(at, &import).status.success());
+    let found = unscrew(at, &["detect", "a.png", "--model", "m.unscrew", "--json"]);
+    assert!(found.status.success(), "{found:?}");
+    // stage 1 where stage 2 belongs
+    let swapped = ["model", "import", "--fine", "onnx/coarse.onnx", "--out", "x.unscrew"];
+    refused(at, &swapped, &["fine0"]);
+    assert!(!at.join("x.unscrew").exists());
+    refused(
+        at,
+        &["model", "import", "--fine", "a.png", "--out", "x.unscrew"],
+        &["a.png", "ONNX"],
+    );
+}
+
+#[test]
 fn a_reader_that_has_seen_enough_ends_a_command_quietly() {
     let mut child = Command::new(env!("CARGO_BIN_EXE_unscrew"))
         .args(["calibrate", "plan", "--spacing-mm", "20"])

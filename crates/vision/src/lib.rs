@@ -50,7 +50,9 @@ pub use detect::{Detections, Detector, Drive, Options, Region, Screw, Timing, Ve
 pub use fine::{Evidence, look};
 pub use locate::{DepthSource, Located, facings, locate, parallax_px};
 pub use marker::{LocatedMarker, Marker, MarkerError, MarkerSpec, find_marker, locate_marker};
-pub use model::{Corrections, Model, ModelError, Settings, Thresholds, decode_model, encode_model, model_id};
+pub use model::{
+    Corrections, EMBEDDED_MODEL, Model, ModelError, Settings, Thresholds, decode_model, encode_model, model_id,
+};
 pub use overlay::{overlay, verdict_color};
 pub use quality::{Doubt, doubts};
 pub use report::{Hull, ImageReport, Mapped, ScrewReport};

@@ -18,7 +18,7 @@ const VERSION: u8 = b'1';
 const PREAMBLE: usize = 12;
 
 /// The model that ships with the program.
-static EMBEDDED: &[u8] = include_bytes!("../models/default.unscrew");
+pub static EMBEDDED_MODEL: &[u8] = include_bytes!("../models/default.unscrew");
 
 /// Limits between the verdicts; training sets them from the cost of a miss, a false find and a person's look.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -224,7 +224,7 @@ impl Model {
     /// # Errors
     /// A [`ModelError`] where the program was built with a damaged file.
     pub fn embedded() -> Result<Self, ModelError> {
-        Self::named(EMBEDDED, "the built-in model")
+        Self::named(EMBEDDED_MODEL, "the built-in model")
     }
 
     /// Reads a model from the bytes of its file.
@@ -398,7 +398,7 @@ mod tests {
         let model = Model::embedded()?;
         assert_eq!(model.fine.len(), 3);
         assert!(model.id().starts_with("sha256:") && model.id().len() == 71);
-        let (networks, settings) = decode_model(EMBEDDED, "m.unscrew")?;
+        let (networks, settings) = decode_model(EMBEDDED_MODEL, "m.unscrew")?;
         let fine = [0, 1, 2].map(|i| networks[&format!("fine{i}")].clone());
         let again = encode_model(&networks["coarse"], &fine, &settings)?;
         assert_eq!(Model::from_bytes(&again)?.settings, model.settings);
@@ -410,15 +410,15 @@ mod tests {
     fn what_is_no_model_says_so_and_names_the_file() {
         assert!(message(b"").contains("m.unscrew is not an unscrew model"));
         assert!(message(b"PNG, or some text that is long enough").contains("not an unscrew model"));
-        let mut other = EMBEDDED.to_vec();
+        let mut other = EMBEDDED_MODEL.to_vec();
         other[7] = b'9';
         assert!(message(&other).contains("format '9'"));
-        assert!(message(&EMBEDDED[..EMBEDDED.len() - 1]).contains("m.unscrew is damaged"));
-        assert!(message(&EMBEDDED[..20]).contains("m.unscrew is damaged"));
-        let mut scrambled = EMBEDDED.to_vec();
+        assert!(message(&EMBEDDED_MODEL[..EMBEDDED_MODEL.len() - 1]).contains("m.unscrew is damaged"));
+        assert!(message(&EMBEDDED_MODEL[..20]).contains("m.unscrew is damaged"));
+        let mut scrambled = EMBEDDED_MODEL.to_vec();
         scrambled[PREAMBLE] = b'?';
         assert!(message(&scrambled).contains("header of the model m.unscrew"));
-        let (mut networks, settings) = decode_model(EMBEDDED, "m").expect("the built-in model");
+        let (mut networks, settings) = decode_model(EMBEDDED_MODEL, "m").expect("the built-in model");
         let coarse = networks.remove("coarse").expect("a coarse network");
         let swapped = encode_model(&coarse, std::slice::from_ref(&coarse), &settings).expect("fits");
         assert!(message(&swapped).contains("network fine0 of the model m.unscrew has 3 input and 2 output channels"));

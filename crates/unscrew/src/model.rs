@@ -1,0 +1,111 @@
+//! `unscrew model`: a model's networks as ONNX files, and a model from such files.
+
+use crate::{Ended, output};
+use anyhow::{Context, Result};
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use vision::{Settings, decode_model, encode_model};
+
+/// What to do with a model.
+#[derive(clap::Subcommand)]
+pub enum Command {
+    /// Write each network as an ONNX file, for other programs to run.
+    Export(Export),
+    /// Make a model from ONNX files: one chain of convolutions each, with the inputs and outputs of `vision::layout`.
+    Import(Import),
+}
+
+/// The networks of a model as `coarse.onnx`, `fine0.onnx`, ...: N, C, H, W floats in, logits out.
+///
+/// Colours come as -1 (black) to 1 (white); the fine networks see clips of 64 x 64 pixels, gamma corrected, with local contrast as a
+/// fourth channel.
+#[derive(clap::Args)]
+#[command(after_help = "Example: unscrew model export --out onnx")]
+pub struct Export {
+    /// Model file; left out, the built-in one
+    #[arg(long, value_name = "FILE")]
+    model: Option<PathBuf>,
+    /// Folder for the files
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+}
+
+/// A model with networks from ONNX files, and thresholds and sigma factors of another model.
+#[derive(clap::Args)]
+#[command(
+    after_help = "Example: unscrew model import --fine mine.onnx --out mine.unscrew\nThen:    unscrew train --from mine.unscrew --coarse-steps 0 --fine-steps 0 --units 1 --out tuned.unscrew   # its own thresholds"
+)]
+pub struct Import {
+    /// Network of stage 1; left out, that of the other model
+    #[arg(long, value_name = "FILE")]
+    coarse: Option<PathBuf>,
+    /// Networks of stage 2; left out, those of the other model
+    #[arg(long, value_name = "FILE", num_args = 1..)]
+    fine: Vec<PathBuf>,
+    /// The other model; left out, the built-in one
+    #[arg(long, value_name = "FILE")]
+    model: Option<PathBuf>,
+    /// Model file to write
+    #[arg(long, value_name = "FILE")]
+    out: PathBuf,
+}
+
+/// A model's stage 1, stage 2 and settings.
+fn networks(model: Option<&Path>) -> Result<(Vec<u8>, Vec<Vec<u8>>, Settings)> {
+    let (bytes, name) = match model {
+        Some(path) => {
+            let name = path.display().to_string();
+            (std::fs::read(path).with_context(|| format!("reading {name}"))?, name)
+        }
+        None => (vision::EMBEDDED_MODEL.to_vec(), "the built-in model".into()),
+    };
+    let (mut networks, settings) = decode_model(&bytes, &name)?;
+    let coarse = networks
+        .remove("coarse")
+        .with_context(|| format!("{name} has no coarse network"))?;
+    Ok((coarse, networks.into_values().collect(), settings))
+}
+
+pub fn run(command: &Command) -> Result<Ended> {
+    match command {
+        Command::Export(args) => export(args),
+        Command::Import(args) => import(args),
+    }
+}
+
+fn export(args: &Export) -> Result<Ended> {
+    output::prepare_folder(&args.out)?;
+    let (coarse, fine, _) = networks(args.model.as_deref())?;
+    let fine = fine
+        .iter()
+        .enumerate()
+        .map(|(k, bytes)| (format!("fine{k}.onnx"), bytes));
+    for (name, bytes) in std::iter::once(("coarse.onnx".into(), &coarse)).chain(fine) {
+        let path = args.out.join(name);
+        geometry::write_aside(&path, &nn::onnx::export(&nn::Network::from_bytes(bytes)?))?;
+        println!("{}", path.display());
+    }
+    Ok(Ended::Good)
+}
+
+fn import(args: &Import) -> Result<Ended> {
+    let read = |path: &PathBuf| -> Result<Vec<u8>> {
+        let name = path.display();
+        let bytes = std::fs::read(path).with_context(|| format!("reading {name}"))?;
+        nn::onnx::import(&bytes).with_context(|| format!("reading {name}"))
+    };
+    let (mut coarse, mut fine, mut settings) = networks(args.model.as_deref())?;
+    if let Some(path) = &args.coarse {
+        coarse = read(path)?;
+    }
+    if !args.fine.is_empty() {
+        fine = args.fine.iter().map(read).collect::<Result<_>>()?;
+    }
+    let files: Vec<&PathBuf> = args.coarse.iter().chain(&args.fine).collect();
+    settings.facts = BTreeMap::from([("imported".into(), serde_json::json!(files))]);
+    let bytes = encode_model(&coarse, &fine, &settings)?;
+    vision::Detector::from_bytes(&bytes)?; // inputs and outputs are what detection expects
+    geometry::write_aside(&args.out, &bytes)?;
+    println!("{} ({})", args.out.display(), vision::model_id(&bytes));
+    Ok(Ended::Good)
+}
