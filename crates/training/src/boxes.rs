@@ -64,6 +64,9 @@ pub struct DrawnBox {
     pub high: [f64; 2],
 }
 
+/// A box's kind, its left and upper and its right and lower edge.
+type Edges = (BoxKind, [f64; 2], [f64; 2]);
+
 /// A picture with its boxes.
 #[derive(Clone, Debug, PartialEq)]
 pub struct BoxedPicture {
@@ -74,7 +77,7 @@ pub struct BoxedPicture {
     /// What it shows: pictures of one scene show the same fasteners.
     pub scene: String,
     /// Boxes, in shares of the picture (YOLO) or in pixels, both from the outer edge of the first pixel.
-    boxes: Vec<(BoxKind, [f64; 2], [f64; 2])>,
+    boxes: Vec<Edges>,
     shares: bool,
 }
 
@@ -292,7 +295,7 @@ fn yolo_pictures(folder: &Path) -> Result<Vec<BoxedPicture>, BoxesError> {
 }
 
 /// Lines of `class x y w h`, perhaps with a score, or `class x1 y1 x2 y2 x3 y3 ...` (a polygon), as shares of the picture's size.
-fn yolo_boxes(text: &str, kinds: &BTreeMap<usize, BoxKind>) -> Result<Vec<(BoxKind, [f64; 2], [f64; 2])>, String> {
+fn yolo_boxes(text: &str, kinds: &BTreeMap<usize, BoxKind>) -> Result<Vec<Edges>, String> {
     let mut boxes = Vec::new();
     for (line, number) in text.lines().zip(1..) {
         let fields: Vec<&str> = line.split_whitespace().collect();
