@@ -65,7 +65,7 @@ pub fn patches(folder: &Path, seed: u64) -> Result<(Vec<Patch>, String), TrainEr
         .iter()
         .map(|path| std::fs::read_to_string(path).map_err(|source| unreadable(path, source)))
         .collect::<Result<_, _>>()?;
-    let per_picture: Vec<Vec<Patch>> = files
+    let per_picture: Vec<(Vec<Patch>, String)> = files
         .par_iter()
         .zip(&texts)
         .enumerate()
@@ -80,10 +80,12 @@ pub fn patches(folder: &Path, seed: u64) -> Result<(Vec<Patch>, String), TrainEr
                 return Err(malformed(format!("its picture is smaller than {PATCH_PX} pixels")));
             }
             let mut rng = Pcg64Mcg::seed_from_u64(seed.wrapping_mul(0x9E37_79B9) ^ k as u64);
-            Ok(of_picture(&picture, &labels(&file), &mut rng))
+            let id = sha256_hex(picture.as_raw()) + text;
+            Ok((of_picture(&picture, &labels(&file), &mut rng), id))
         })
         .collect::<Result<_, TrainError>>()?;
-    Ok((per_picture.concat(), sha256_hex(texts.concat().as_bytes())))
+    let (patches, ids): (Vec<Vec<Patch>>, Vec<String>) = per_picture.into_iter().unzip();
+    Ok((patches.concat(), sha256_hex(ids.concat().as_bytes())))
 }
 
 fn labels(file: &TruthFile) -> Vec<(Pixel, f64, Classes)> {

@@ -225,7 +225,10 @@ pub fn train(settings: &TrainSettings, out: &Path, progress: &dyn Progress) -> R
     let trunk = Trainer::new(fine_spec(), settings.seed + 1);
     let trunk = lesson.learn("shared", trunk, Stage::Fine, shared, &mut losses)?;
     let mut fine = Vec::new();
-    for k in 0..ENSEMBLE {
+    // a model that is gone on with keeps its number of networks
+    let begun = start.keys().filter(|name| name.starts_with("fine")).count() as u64;
+    let networks = if begun == 0 { ENSEMBLE } else { begun };
+    for k in 0..networks {
         let name = format!("fine{k}");
         let trainer = match start.get(&name) {
             Some(bytes) => Trainer::from_bytes(bytes)?,
@@ -397,6 +400,7 @@ impl Lesson<'_> {
                 RECIPE,
                 WARM_UP,
                 LATE_PLACE,
+                PICTURED,
                 settings_key(settings),
                 trainer.spec(),
                 name

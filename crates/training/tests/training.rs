@@ -107,3 +107,23 @@ fn pictures_with_truth_are_learned_from_or_named() -> Result<(), Box<dyn std::er
     assert!(matches!(train(&settings, &out, &Silent), Err(TrainError::Truth { path, .. }) if path == truth));
     Ok(())
 }
+
+#[test]
+fn a_model_of_one_network_is_gone_on_with_as_one() -> Result<(), Box<dyn std::error::Error>> {
+    let folder = tempfile::tempdir()?;
+    let (from, out) = (folder.path().join("one.unscrew"), folder.path().join("model.unscrew"));
+    let (mut networks, settings) = vision::decode_model(vision::EMBEDDED_MODEL, "embedded")?;
+    let take = |networks: &mut std::collections::BTreeMap<String, Vec<u8>>, name| networks.remove(name).expect(name);
+    let (coarse, fine) = (take(&mut networks, "coarse"), take(&mut networks, "fine0"));
+    fs::write(&from, vision::encode_model(&coarse, &[fine], &settings)?)?;
+    let nothing_to_learn = TrainSettings {
+        coarse_steps: 0,
+        fine_steps: 0,
+        from: Some(from.clone()),
+        ..tiny(None)
+    };
+    train(&nothing_to_learn, &out, &Silent)?;
+    let run = |path| vision::Model::load(path).map(|m| m.fine.iter().map(nn::onnx::export).collect::<Vec<_>>());
+    assert_eq!(run(&out)?, run(&from)?);
+    Ok(())
+}
