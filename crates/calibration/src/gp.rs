@@ -4,6 +4,7 @@
 //! kernels, chosen by likelihood. Gears add waves that are far shorter than the distance of calibrated points, but they are waves of
 //! the joint angle: see [`Ripple`].
 
+use crate::arm::Arm;
 use crate::ripple::{self, Ripple, Wave};
 use nalgebra::{Cholesky, DMatrix, DVector, Dyn, Isometry3, Point3, Vector3};
 use serde::{Deserialize, Serialize};
@@ -179,12 +180,12 @@ impl Points {
     }
 
     /// What a wave of a joint does to every point, cosine and sine, along the directions of its ray, one below the other.
-    fn wave(&self, ripple: &Ripple, joints: &[[f64; 3]], wave: Wave) -> DMatrix<f64> {
+    fn wave(&self, turns: &Turns, wave: Wave) -> DMatrix<f64> {
         let n = self.places.len();
         let mut effect = DMatrix::zeros(3 * n, 2);
         for i in 0..n {
-            let lever = ripple.lever(self.command[i], joints[i], wave.joint);
-            let (sin, cos) = (wave.cycles * joints[i][wave.joint]).sin_cos();
+            let lever = turns.levers[i][wave.joint];
+            let (sin, cos) = (wave.cycles * turns.joints_rad[i][wave.joint]).sin_cos();
             for a in 0..3 {
                 let along = lever.dot(&self.frames[i][a]);
                 effect[(a * n + i, 0)] = along * cos;
@@ -192,6 +193,21 @@ impl Points {
             }
         }
         effect
+    }
+}
+
+/// Joint angles at every point, and how each joint moves it.
+struct Turns {
+    joints_rad: Vec<[f64; 3]>,
+    levers: Vec<[Vector3<f64>; 3]>,
+}
+
+impl Turns {
+    fn new(arm: &Arm, command: &[Vector3<f64>], joints_rad: &[[f64; 3]]) -> Self {
+        Self {
+            joints_rad: joints_rad.to_vec(),
+            levers: command.iter().map(|c| arm.pose(*c).levers).collect(),
+        }
     }
 }
 
@@ -280,10 +296,10 @@ fn stacked(parts: &[DVector<f64>; 3]) -> DVector<f64> {
     DVector::from_fn(3 * n, |i, _| parts[i / n][i % n])
 }
 
-fn side_by_side(points: &Points, joints: &[[f64; 3]], ripple: &Ripple, waves: &[Wave]) -> DMatrix<f64> {
+fn side_by_side(points: &Points, turns: &Turns, waves: &[Wave]) -> DMatrix<f64> {
     let mut all = DMatrix::zeros(3 * points.places.len(), 2 * waves.len());
     for (k, wave) in waves.iter().enumerate() {
-        all.columns_mut(2 * k, 2).copy_from(&points.wave(ripple, joints, *wave));
+        all.columns_mut(2 * k, 2).copy_from(&points.wave(turns, *wave));
     }
     all
 }
@@ -364,14 +380,15 @@ pub(crate) fn fit(camera: &[Vector3<f64>], command: &[Vector3<f64>], joints: Opt
     let used = chosen(&keep);
     let points = points_of(&used);
     let of_used: Option<Vec<[f64; 3]>> = joints.map(|q| used.iter().map(|&i| q[i]).collect());
-    let mut ripple = of_used.as_ref().and_then(|q| Ripple::of_arm(&points.command, q));
+    let mut ripple = of_used
+        .as_ref()
+        .and_then(|q| Arm::of(&points.command, q).map(Ripple::of));
+    let mut all = DMatrix::zeros(3 * used.len(), 0);
     if let (Some(ripple), Some(joints)) = (&mut ripple, &of_used) {
-        both = waves(&points, joints, ripple, both)?;
+        let turns = Turns::new(&ripple.arm, &points.command, joints);
+        both = waves(&points, &turns, ripple, both)?;
+        all = side_by_side(&points, &turns, &ripple.waves);
     }
-    let all = match (&ripple, &of_used) {
-        (Some(ripple), Some(joints)) => side_by_side(&points, joints, ripple, &ripple.waves),
-        _ => DMatrix::zeros(3 * used.len(), 0),
-    };
     let system = System::new(&points, both, all)?;
     let (errors, variances) = system.left_out(&stacked(&points.residuals));
     let n = used.len();
@@ -403,7 +420,7 @@ pub(crate) fn fit(camera: &[Vector3<f64>], command: &[Vector3<f64>], joints: Opt
 }
 
 /// Finds the waves that make left-out errors smaller, one after the other; the kernels follow what each leaves.
-fn waves(points: &Points, joints: &[[f64; 3]], ripple: &mut Ripple, start: [Kernel; 2]) -> Option<[Kernel; 2]> {
+fn waves(points: &Points, turns: &Turns, ripple: &mut Ripple, start: [Kernel; 2]) -> Option<[Kernel; 2]> {
     let residuals = stacked(&points.residuals);
     let n = points.places.len();
     let square = |system: &System| system.left_out(&residuals).0.norm_squared();
@@ -412,7 +429,7 @@ fn waves(points: &Points, joints: &[[f64; 3]], ripple: &mut Ripple, start: [Kern
     let mut least = square(&system);
     while ripple.waves.len() < ripple::MOST_WAVES {
         let weights = system.times(&residuals);
-        let gain = |wave: Wave| system.gain(&weights, &points.wave(ripple, joints, wave));
+        let gain = |wave: Wave| system.gain(&weights, &points.wave(turns, wave));
         let free = |wave: &Wave| {
             let near = |w: &Wave| w.joint == wave.joint && (w.cycles - wave.cycles).abs() < ripple::APART;
             !ripple.waves.iter().any(near)
@@ -421,7 +438,7 @@ fn waves(points: &Points, joints: &[[f64; 3]], ripple: &mut Ripple, start: [Kern
         let (gained, wave) = ripple::refined(found.max_by(|a, b| a.0.total_cmp(&b.0))?, &gain);
         let mut more = ripple.clone();
         more.waves.push(wave);
-        let columns = side_by_side(points, joints, &more, &more.waves);
+        let columns = side_by_side(points, turns, &more.waves);
         let with = System::new(points, both, columns.clone())?;
         let swing = &columns * (columns.transpose() * with.times(&residuals)) * ripple::PRIOR_RAD.powi(2);
         let rest = [0, 1, 2].map(|a| DVector::from_fn(n, |i, _| points.residuals[a][i] - swing[a * n + i]));
@@ -477,7 +494,10 @@ impl Gp {
     fn bake(points: &Points, joints: Option<&[[f64; 3]]>, choice: &Choice) -> Option<Self> {
         let n = points.places.len();
         let columns = match (&choice.ripple, joints) {
-            (Some(ripple), Some(joints)) => side_by_side(points, joints, ripple, &ripple.waves),
+            (Some(ripple), Some(joints)) => {
+                let turns = Turns::new(&ripple.arm, &points.command, joints);
+                side_by_side(points, &turns, &ripple.waves)
+            }
             _ => DMatrix::zeros(3 * n, 0),
         };
         let system = System::new(points, [choice.across, choice.along], columns)?;

@@ -1,12 +1,13 @@
 //! The map from camera to robot: fitted from pairs, kept in a file with all that made it, asked for points with their sigma.
 
 use crate::{
-    Figures, FitError, FitReport, Level, Pair, Rejected, Volume, correct,
+    Figures, FitError, FitReport, Level, Pair, Rejected, Volume,
+    arm::Arm,
+    correct,
     gp::{self, Choice, Gp},
     lattice::{Estimate, Grid, LEVELS, MAX_LEVERAGE, Model, Shape, believable, split},
     pair, realign,
     rigid::{self, Points, quantile},
-    ripple::Ripple,
     tps::{self, Spline},
 };
 use geometry::{Base, Camera, CameraModel, Point, Transform};
@@ -605,8 +606,8 @@ impl Map {
     }
 
     /// The arm's lengths and tool, where ripple was found.
-    pub(crate) fn arm(&self) -> Option<&Ripple> {
-        self.file.gp.as_ref()?.ripple.as_ref()
+    pub(crate) fn arm(&self) -> Option<&Arm> {
+        Some(&self.file.gp.as_ref()?.ripple.as_ref()?.arm)
     }
 
     /// The arm and the camera that the map is true for.

@@ -3,7 +3,7 @@
 //! A camera that was bumped sees every point as if the world had moved: that is taken out before the map is asked, so that what
 //! the map knows of the arm stays where the arm is. Joint zeros that a crash has changed are taken out after it.
 
-use crate::{Figures, Map, Pair, rigid, ripple::Ripple};
+use crate::{Figures, Map, Pair, arm::Arm, rigid};
 use geometry::{Camera, Point};
 use nalgebra::{DMatrix, DVector, Isometry3, Matrix3, Point3, Translation3, UnitQuaternion, Vector3};
 use serde::{Deserialize, Serialize};
@@ -153,7 +153,7 @@ pub(crate) struct Layer {
     pub(crate) told: Realignment,
     then_from_now: Isometry3<f64>,
     /// Turns of J2 and J3, and the arm that they turn.
-    zeros: Option<([f64; 2], Ripple)>,
+    zeros: Option<([f64; 2], Arm)>,
     /// Covariance of shift (mm), turn (rad) and zeros (rad), row by row.
     covariance: Vec<f64>,
 }
@@ -199,9 +199,9 @@ const MAX_SCORE: f64 = 4.5;
 /// If half of the pairs stay off by more, the world has not moved as one, mm.
 const DISAGREE_MM: f64 = 2.0;
 
-fn levers(arm: &Ripple, base: Vector3<f64>) -> [Vector3<f64>; 2] {
-    let joints = arm.joints(base);
-    [arm.lever(base, joints, 1), arm.lever(base, joints, 2)]
+fn levers(arm: &Arm, base: Vector3<f64>) -> [Vector3<f64>; 2] {
+    let [_, lower, upper] = arm.pose(base).levers;
+    [lower, upper]
 }
 
 /// How the mapped point moves with shift, turn and zeros: 3 rows, base frame.
@@ -271,7 +271,7 @@ impl Map {
                 .iter()
                 .map(|(p, _)| p.joints_rad.map(|q| [q[0], q[1], q[2]]))
                 .collect();
-            Ripple::of_arm(&command, &joints?)
+            Arm::of(&command, &joints?)
         });
         let arm = match arm {
             Some(found) => Some(found.or_else(|| self.arm().cloned()).ok_or(RealignError::NoJoints)?),
@@ -376,7 +376,7 @@ impl Map {
     }
 
     /// What a solution leaves of a pair: command less what is said, base frame, mm, and in sigmas.
-    fn left(&self, fresh: &Fresh, solution: &Solution, arm: Option<&Ripple>) -> (Vector3<f64>, f64) {
+    fn left(&self, fresh: &Fresh, solution: &Solution, arm: Option<&Arm>) -> (Vector3<f64>, f64) {
         let then = solution.then_from_now * Point3::from(fresh.camera);
         let mut said = self.apply(Point::from_vector(then.coords)).base.vector();
         if let Some(arm) = arm {
@@ -394,7 +394,7 @@ impl Map {
         used: &[usize],
         moved: Moved,
         rotation: &Matrix3<f64>,
-        arm: Option<&Ripple>,
+        arm: Option<&Arm>,
     ) -> Solution {
         let n = moved.unknowns();
         let mut solution = Solution {
