@@ -29,7 +29,7 @@ from pathlib import Path
 import bpy
 import numpy as np
 from mathutils import Matrix
-from PIL import Image
+from PIL import Image, ImageFilter
 
 SIZE = 940  # pixels, width and height of a plate
 PIXEL = 0.32  # mm on the sheet
@@ -1003,6 +1003,16 @@ def truth(name, screws, negatives, camera, cables):
     return out
 
 
+def without_contrast(photo, screw):
+    """True where the middle of a head differs from a slope by less than 4 grey levels: nothing of its recess is to be seen."""
+    u, v, reach = screw["u"], screw["v"], 0.275 * screw["head_d_px"]
+    across, down = np.meshgrid(np.arange(photo.shape[1]) - u, np.arange(photo.shape[0]) - v)
+    inside = across ** 2 + down ** 2 < reach ** 2
+    slope = np.stack([np.ones(inside.sum()), across[inside], down[inside]], 1)
+    fitted = slope @ np.linalg.lstsq(slope, photo[inside], rcond=None)[0]
+    return float(np.std(photo[inside] - fitted)) < 4.0
+
+
 def make_plate(seed, picture, record):
     rng = np.random.default_rng(seed)
     bpy.ops.wm.read_factory_settings(use_empty=True)
@@ -1020,6 +1030,9 @@ def make_plate(seed, picture, record):
     photograph(rng, linear, sheet.name == "dark").save(photo, "JPEG", quality=int(rng.integers(82, 96)))
     picture.write_bytes(photo.getvalue())
     described = truth(picture.name, screws, negatives, camera, cables)
+    gray = np.asarray(Image.open(photo).convert("L").filter(ImageFilter.GaussianBlur(1.0)), float)
+    for screw in described["screws"]:
+        screw["detectable"] &= not without_contrast(gray, screw)
     partial = record.with_suffix(".part")
     partial.write_text(json.dumps(described))
     os.replace(partial, record)

@@ -27,18 +27,30 @@ pub trait Finder: Send + Sync {
     ///
     /// # Arguments
     /// * `odds` – how much likelier than the picture alone says a doubtful head is a screw (1 without other evidence).
-    fn find(&self, frame: &RgbdFrame, odds: f64) -> Vec<vision::Screw>;
+    ///
+    /// # Errors
+    /// [`DeviceError::Fault`] if it could not look: that nothing was found then means nothing.
+    fn find(&self, frame: &RgbdFrame, odds: f64) -> Result<Vec<vision::Screw>, DeviceError>;
     /// What made it, for the record.
     fn model(&self) -> String;
 }
 
 impl Finder for vision::Detector {
-    fn find(&self, frame: &RgbdFrame, odds: f64) -> Vec<vision::Screw> {
+    fn find(&self, frame: &RgbdFrame, odds: f64) -> Result<Vec<vision::Screw>, DeviceError> {
         let options = vision::Options {
             odds,
             ..vision::Options::default()
         };
-        self.detect(frame, &options).screws
+        let found = self.detect(frame, &options);
+        match found.doubts.iter().find(|d| matches!(d, vision::Doubt::NotSeen { .. })) {
+            Some(doubt) => Err(DeviceError::Fault {
+                device: "detector".into(),
+                action: "looking for screws".into(),
+                code: 0,
+                text: doubt.to_string(),
+            }),
+            None => Ok(found.screws),
+        }
     }
     fn model(&self) -> String {
         vision::Detector::model(self).id().to_owned()
@@ -467,7 +479,7 @@ impl Way<'_> {
         let config = self.runner.config.clone();
         let shot = shoot(&self.runner.devices, None, config.inspection.depth_frames).await?;
         let odds = self.odds(purpose);
-        let mut screws = self.runner.finder.find(&shot.frame, odds);
+        let mut screws = self.runner.finder.find(&shot.frame, odds)?;
         self.budget(&shot);
         let certain = screws
             .iter()
@@ -703,7 +715,7 @@ impl Way<'_> {
             config.inspection.depth_frames.max(1),
         )
         .await?;
-        let screws = self.runner.finder.find(&near.frame, self.face_odds());
+        let screws = self.runner.finder.find(&near.frame, self.face_odds())?;
         self.budget(&near);
         let picture = self
             .runner
@@ -796,7 +808,7 @@ impl Way<'_> {
         let mut pictures = Vec::new();
         for region in regions_around(&camera, &pixels, half_px) {
             let near = shoot(&self.runner.devices, Some(region), 0).await?;
-            let screws = self.runner.finder.find(&near.frame, self.face_odds());
+            let screws = self.runner.finder.find(&near.frame, self.face_odds())?;
             self.budget(&near);
             pictures.push(
                 self.runner

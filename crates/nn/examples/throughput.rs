@@ -2,13 +2,14 @@
 //!
 //! ```sh
 //! cargo run --release -p nn --example throughput [training]
+//! # beside ONNX Runtime, whose library ORT_DYLIB_PATH names; RAYON_NUM_THREADS=1 for one core
+//! cargo run --release -p nn --features ort --example throughput
 //! ```
 
 use std::hint::black_box;
 use std::time::Instant;
 
 use nn::{LayerSpec, RowSource, Spec, Tensor, Trainer};
-use rayon::prelude::*;
 
 /// A picture that costs nothing to read.
 struct Grey(usize, usize, usize);
@@ -85,11 +86,66 @@ fn multiply_add(steps: usize) -> u64 {
     32 * 2 * steps as u64
 }
 
+/// Highest memory that this process has had, MB.
+fn peak_mb() -> Option<f64> {
+    let status = std::fs::read_to_string("/proc/self/status").ok()?;
+    let line = status.lines().find(|l| l.starts_with("VmHWM:"))?;
+    Some(line.split_whitespace().nth(1)?.parse::<f64>().ok()? / 1024.0)
+}
+
+/// The same networks by each engine: a whole picture through one as in stage 1, many clips through one as in stage 2.
+fn engines(whole: &Spec) {
+    let conv = LayerSpec::conv;
+    let mut clips = [32, 64, 64, 64, 128, 128, 128].map(|out| conv(3, 1, 1, out));
+    for k in [0, 1, 4] {
+        clips[k] = conv(3, 2, 1, [32, 64, 0, 0, 128][k]);
+    }
+    let clips = Spec {
+        input_channels: 4,
+        layers: clips
+            .into_iter()
+            .chain([LayerSpec::Upsample2, LayerSpec::output(10)])
+            .collect(),
+    };
+    let (h, w, n) = (3006, 4104, 128);
+    let (whole, clips) = (
+        Trainer::new(whole.clone(), 1).network(),
+        Trainer::new(clips, 1).network(),
+    );
+    let (picture, batch) = (Grey(h, w, 3), Tensor::zeros(n, 64, 64, 4));
+    let (whole_gflop, clips_gflop) = (
+        whole.spec().flops(h, w) as f64 / 1e9,
+        (n as u64 * clips.spec().flops(64, 64)) as f64 / 1e9,
+    );
+    println!("engines: {h} x {w} pixels ({whole_gflop:.1} GFLOP); {n} clips of 64 x 64 ({clips_gflop:.1} GFLOP)");
+    let say = |name: &str, whole_s: f64, clips_s: f64| {
+        let peak = peak_mb().map_or(String::new(), |mb| format!(", {mb:.0} MB at most so far"));
+        println!("  {name:12} {:7.1} ms, {:7.1} ms{peak}", 1e3 * whole_s, 1e3 * clips_s);
+    };
+    let own = [
+        fastest(8, || drop(black_box(whole.forward(&picture)))),
+        fastest(8, || drop(black_box(clips.forward_batch(&batch)))),
+    ];
+    say("own kernels", own[0], own[1]);
+    #[cfg(feature = "ort")]
+    {
+        let session = |network: &nn::Network| network.through_onnx_runtime(nn::onnx_runtime::Provider::Cpu);
+        match (session(&whole), session(&clips)) {
+            (Ok(whole), Ok(clips)) => say(
+                "ONNX Runtime",
+                fastest(8, || drop(black_box(whole.forward(&picture)))),
+                fastest(8, || drop(black_box(clips.forward_batch(&batch)))),
+            ),
+            (Err(error), _) | (_, Err(error)) => println!("  {error}"),
+        }
+    }
+}
+
 fn main() {
     let threads = rayon::current_num_threads();
     let mut operations = 0;
     let seconds = fastest(20, || {
-        operations = (0..threads).into_par_iter().map(|_| multiply_add(1 << 20)).sum();
+        operations = rayon::broadcast(|_| multiply_add(1 << 21)).into_iter().sum::<u64>();
     });
     let peak = operations as f64 / seconds / 1e9;
     println!("{threads} threads, {peak:.0} GFLOP/s of multiplications and additions");
@@ -130,6 +186,9 @@ fn main() {
         println!("  {name:24} {h:5} x {w:4} {ms:8.1} ms {rate:6.0} GFLOP/s {share:4.0} %");
     }
 
+    if !training_only {
+        engines(&detector);
+    }
     println!("training, batch 128 of 64 x 64 x 3");
     let mut trainer = Trainer::new(detector.clone(), 1);
     let mut batch = Tensor::zeros(128, 64, 64, 3);

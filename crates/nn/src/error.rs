@@ -60,4 +60,7 @@ pub enum NnError {
     /// An ONNX model that is not one chain of the layers that can be run.
     #[error("the ONNX model cannot be used: {0}")]
     Onnx(String),
+    /// ONNX Runtime is needed and not there, or failed.
+    #[error("ONNX Runtime: {0}")]
+    OnnxRuntime(String),
 }

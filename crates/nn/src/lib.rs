@@ -2,7 +2,8 @@
 //!
 //! The networks of `vision` run here and those of `training` learn here; this crate knows nothing of screws.
 //! A [`Spec`] describes a sequential fully convolutional network, a [`Trainer`] learns its parameters and writes them
-//! as safetensors, a [`Network`] reads them and runs them over whole pictures or batches of clips.
+//! as safetensors, a [`Network`] reads them and runs them over whole pictures or batches of clips; an [`Engine`] is such a network, or
+//! with the feature `ort` any ONNX graph.
 //!
 //! Everything rests on one register-blocked kernel (AVX-512, AVX2 or portable, found at run time). Results do not depend
 //! on the number of threads nor on how a picture is cut into strips.
@@ -30,16 +31,20 @@
 
 mod conv;
 mod elementwise;
+mod engine;
 mod error;
 mod file;
 mod kernel;
 mod loss;
 mod network;
 pub mod onnx;
+#[cfg(feature = "ort")]
+pub mod onnx_runtime;
 mod spec;
 mod tensor;
 mod train;
 
+pub use engine::Engine;
 pub use error::NnError;
 pub use file::metadata;
 pub use loss::{softmax, softmax_cross_entropy};

@@ -8,6 +8,7 @@ mod batch;
 mod boxes;
 mod evaluate;
 mod face;
+mod mine;
 mod pictures;
 mod real;
 mod samples;

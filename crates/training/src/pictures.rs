@@ -1,9 +1,8 @@
 //! Pictures with exact truth from elsewhere as patches: what `path_traced.py` makes, or anyone's own in the same form.
 
 use crate::TrainError;
-use crate::samples::{Classes, PATCH_PX, Patch, decoy_class, from_picture, only};
+use crate::samples::{Classes, PATCH_PX, Patch, crop, decoy_class, only};
 use geometry::{Pixel, RgbImage, read_color, sha256_hex};
-use image::imageops;
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use rayon::prelude::*;
@@ -103,25 +102,14 @@ fn labels(file: &TruthFile) -> Vec<(Pixel, f64, Classes)> {
 }
 
 fn of_picture(picture: &RgbImage, labels: &[(Pixel, f64, Classes)], rng: &mut Pcg64Mcg) -> Vec<Patch> {
-    let side = PATCH_PX as u32;
-    let cut = |center: Pixel, focused: bool| {
-        let corner =
-            |c: f64, size: u32| (c.round() as i64 - i64::from(side / 2)).clamp(0, i64::from(size - side)) as u32;
-        let (x, y) = (
-            corner(center.u_px, picture.width()),
-            corner(center.v_px, picture.height()),
-        );
-        let part = imageops::crop_imm(picture, x, y, side, side).to_image();
-        from_picture(&part, labels, [f64::from(x), f64::from(y)], center, focused)
-    };
     let mut patches: Vec<Patch> = labels
         .iter()
         .filter(|label| label.2 != 0)
-        .map(|(p, ..)| cut(*p, true))
+        .map(|(p, ..)| crop(picture, labels, *p, true))
         .collect();
     for _ in 0..ANYWHERE {
         let [u, v] = [picture.width(), picture.height()].map(|size| rng.random_range(0.0..f64::from(size)));
-        patches.push(cut(Pixel::new(u, v), false));
+        patches.push(crop(picture, labels, Pixel::new(u, v), false));
     }
     patches
 }

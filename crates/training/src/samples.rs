@@ -2,6 +2,7 @@
 
 use crate::TrainError;
 use geometry::{Pixel, RgbImage};
+use image::imageops;
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use rayon::prelude::*;
@@ -102,7 +103,7 @@ pub fn cut(view: &Prepared, all: &[(Pixel, f64, Classes)], center: Pixel, focuse
 }
 
 /// The patch that a picture of [`PATCH_PX`]² pixels is, whose first pixel is `corner`, with the labels that lie in it, nearest to `center` first.
-pub(crate) fn from_picture(
+fn from_picture(
     picture: &RgbImage,
     all: &[(Pixel, f64, Classes)],
     corner: [f64; 2],
@@ -118,7 +119,7 @@ pub(crate) fn from_picture(
                 v_px: (p.v_px - corner[1]) as f32,
                 diameter_px: *d as f32,
                 classes: *classes,
-                exact: true,
+                exact: *classes != only(Class::Background), // nothing has no centre
             };
             (p.distance_px(&center), label)
         })
@@ -134,6 +135,18 @@ pub(crate) fn from_picture(
         focused,
         elsewhere: only(Class::Background),
     }
+}
+
+/// Cuts the patch around a place out of a picture of at least [`PATCH_PX`] pixels a side, with the labels that lie in it.
+pub(crate) fn crop(picture: &RgbImage, all: &[(Pixel, f64, Classes)], center: Pixel, focused: bool) -> Patch {
+    let side = PATCH_PX as u32;
+    let corner = |c: f64, size: u32| (c.round() as i64 - i64::from(side / 2)).clamp(0, i64::from(size - side)) as u32;
+    let (x, y) = (
+        corner(center.u_px, picture.width()),
+        corner(center.v_px, picture.height()),
+    );
+    let part = imageops::crop_imm(picture, x, y, side, side).to_image();
+    from_picture(&part, all, [f64::from(x), f64::from(y)], center, focused)
 }
 
 /// Views of a unit as training sees them: one of every face.

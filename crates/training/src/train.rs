@@ -1,12 +1,13 @@
-//! Training: patches, four networks, thresholds, one model file; the same bytes from the same settings on any number of threads.
+//! Training: patches, two networks, thresholds, one model file; the same bytes from the same settings on any number of threads.
 
 use crate::batch::{Batch, Stage, batch, loss};
 use crate::boxes::BoxesError;
+use crate::mine::{Mined, mine};
 use crate::pictures;
 use crate::real;
 use crate::samples::{Patch, any_fastener, only, rendered};
 use crate::tune::{self, Tuning};
-use nn::{Tensor, Trainer};
+use nn::{Engine, Network, Tensor, Trainer};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use serde::Serialize;
@@ -19,8 +20,6 @@ use std::{
 use vision::layout::{Class, coarse_spec, fine_spec};
 use vision::{Detector, Settings, Thresholds, decode_model, encode_model};
 
-/// Networks in the ensemble of stage 2, as in the paper.
-const ENSEMBLE: u64 = 3;
 /// Units below this seed are learned from.
 pub const TRAINING_SEEDS: Range<u64> = 0..500_000;
 /// Units whose faces set thresholds and sigma factors.
@@ -31,6 +30,8 @@ const WARM_UP: usize = 100;
 const LATE_PLACE: f32 = 4.0;
 /// Share of a batch that comes from pictures from elsewhere, against all others together.
 const PICTURED: f64 = 0.3;
+/// Share of a batch that comes from what was mined, against the pools of rendered and real patches together.
+const MINED: f64 = 0.15;
 /// What decides beside the settings what a network learns: a network half trained by another recipe is not gone on with.
 const RECIPE: [&str; 2] = [include_str!("batch.rs"), include_str!("../../vision/src/clip.rs")];
 /// Steps after which a network is written to the work folder.
@@ -102,10 +103,11 @@ pub struct TrainSettings {
     pub learning_rate: f32,
     /// Steps of stage 1.
     pub coarse_steps: usize,
-    /// Steps of each network of stage 2, those that they share included.
+    /// Steps of the network of stage 2.
     pub fine_steps: usize,
-    /// The first steps, which the networks of stage 2 share.
-    pub shared_steps: usize,
+    /// Faces that the half-trained networks look at; where they are wrong is learned from in the rest of the steps. They are of the
+    /// units after those that are learned from.
+    pub mining_faces: u64,
     /// Faces that set thresholds and sigma factors.
     pub tuning_faces: u64,
     /// Seed of everything.
@@ -140,7 +142,7 @@ impl Default for TrainSettings {
             learning_rate: 0.01,
             coarse_steps: 1900,
             fine_steps: 11000,
-            shared_steps: 9500,
+            mining_faces: 0,
             tuning_faces: 150,
             seed: 1,
             from: None,
@@ -180,8 +182,11 @@ pub struct TrainReport {
 /// # Errors
 /// [`TrainError`] if the real photographs cannot be read or the file cannot be written.
 pub fn train(settings: &TrainSettings, out: &Path, progress: &dyn Progress) -> Result<TrainReport, TrainError> {
-    if settings.first_unit.saturating_add(settings.units) > TRAINING_SEEDS.end {
-        return Err(TrainError::TooManyUnits { units: settings.units });
+    let learned = settings.first_unit.saturating_add(settings.units);
+    if learned.saturating_add(settings.mining_faces) > TRAINING_SEEDS.end {
+        return Err(TrainError::TooManyUnits {
+            units: settings.units.saturating_add(settings.mining_faces),
+        });
     }
     let real = real::patches(&settings.data, settings.seed)?; // first: a missing folder is said at once
     let (pictured, pictures_id) = match &settings.pictures {
@@ -204,10 +209,9 @@ pub fn train(settings: &TrainSettings, out: &Path, progress: &dyn Progress) -> R
     counted.extend(count("real", &real));
     counted.extend(count("pictured", &pictured));
     patches.extend(real);
-    let lesson = Lesson {
+    let mut lesson = Lesson {
         settings,
-        patches: &patches,
-        pictured: &pictured,
+        pools: vec![(1.0, &patches), (PICTURED, &pictured)],
         progress,
     };
     let mut losses = BTreeMap::new();
@@ -216,29 +220,44 @@ pub fn train(settings: &TrainSettings, out: &Path, progress: &dyn Progress) -> R
         None => Trainer::new(coarse_spec(), settings.seed),
     };
     let coarse = lesson.learn("coarse", coarse, Stage::Coarse, settings.coarse_steps, &mut losses)?;
-    // the members of the ensemble share their first steps, then each goes its own way
-    let shared = if settings.from.is_some() {
-        0
-    } else {
-        settings.shared_steps
-    };
-    let trunk = Trainer::new(fine_spec(), settings.seed + 1);
-    let trunk = lesson.learn("shared", trunk, Stage::Fine, shared, &mut losses)?;
-    let mut fine = Vec::new();
-    // a model that is gone on with keeps its number of networks
-    let begun = start.keys().filter(|name| name.starts_with("fine")).count() as u64;
-    let networks = if begun == 0 { ENSEMBLE } else { begun };
+    // one network gives what the paper's three give (docs/detection.md); a model that is gone on with keeps its number of them
+    let networks = start.keys().filter(|name| name.starts_with("fine")).count().max(1);
+    let mut trainers = Vec::new();
     for k in 0..networks {
         let name = format!("fine{k}");
         let trainer = match start.get(&name) {
             Some(bytes) => Trainer::from_bytes(bytes)?,
-            None => trunk.clone(),
+            None => Trainer::new(fine_spec(), settings.seed + 1),
         };
-        let trainer = lesson.learn(&name, trainer, Stage::Fine, settings.fine_steps, &mut losses)?;
+        trainers.push(trainer);
+    }
+    let mined;
+    if settings.mining_faces > 0 {
+        // a model that is gone on with can tell at once what it falls for
+        let before = if settings.from.is_some() {
+            0
+        } else {
+            settings.fine_steps / 4 * 3
+        };
+        for (k, trainer) in trainers.iter_mut().enumerate() {
+            *trainer = lesson.learn(&format!("half{k}"), trainer.clone(), Stage::Fine, before, &mut losses)?;
+        }
+        mined = lesson.mined(&coarse.network(), trainers.iter().map(Trainer::network))?;
+        counted.extend(count("mined", &mined));
+        lesson.pools.push((MINED, &mined));
+    }
+    let mut fine = Vec::new();
+    for (k, trainer) in trainers.into_iter().enumerate() {
+        let trainer = lesson.learn(
+            &format!("fine{k}"),
+            trainer,
+            Stage::Fine,
+            settings.fine_steps,
+            &mut losses,
+        )?;
         fine.push(trainer.to_bytes(&BTreeMap::new())?);
     }
     let coarse = coarse.to_bytes(&BTreeMap::new())?;
-    drop((patches, pictured));
     let untuned = Settings {
         thresholds: Thresholds::default(),
         ..Settings::default()
@@ -246,7 +265,7 @@ pub fn train(settings: &TrainSettings, out: &Path, progress: &dyn Progress) -> R
     let detector = Detector::from_bytes(&encode_model(&coarse, &fine, &untuned)?)?;
     let tuning = tune::tune(detector.model(), TUNING_SEEDS.start, settings.tuning_faces, &|done| {
         progress.report("tuning", done, settings.tuning_faces, None);
-    });
+    })?;
     let tuned = Settings {
         thresholds: tuning.thresholds,
         corrections: tuning.corrections,
@@ -369,10 +388,8 @@ fn begun(settings: &TrainSettings) -> Result<(TrainSettings, BTreeMap<String, Ve
 pub struct Lesson<'a> {
     /// The recipe.
     pub settings: &'a TrainSettings,
-    /// What is learned from.
-    pub patches: &'a [Patch],
-    /// Patches of pictures from elsewhere, learned from beside them.
-    pub pictured: &'a [Patch],
+    /// What is learned from: patches, and the weight of all of them together in a batch. The first are drawn by what they are for.
+    pub pools: Vec<(f64, &'a [Patch])>,
     /// Where it says how far it is.
     pub progress: &'a dyn Progress,
 }
@@ -401,6 +418,7 @@ impl Lesson<'_> {
                 WARM_UP,
                 LATE_PLACE,
                 PICTURED,
+                MINED,
                 settings_key(settings),
                 trainer.spec(),
                 name
@@ -421,8 +439,8 @@ impl Lesson<'_> {
             let loss = nn::metadata(&bytes).ok().and_then(|m| m.get("loss")?.parse().ok());
             mean_loss = loss.unwrap_or(f32::NAN);
         }
-        let pools = pools(self.patches, self.pictured, stage);
-        let all: Vec<&Patch> = self.patches.iter().chain(self.pictured).collect();
+        let pools = pools(&self.pools, stage);
+        let all: Vec<&Patch> = self.pools.iter().flat_map(|p| p.1).collect();
         let mut grad = Tensor::default();
         for step in trainer.steps() as usize..last {
             // a generator a step: a training that goes on draws what it would have drawn
@@ -458,6 +476,25 @@ impl Lesson<'_> {
         }
         Ok(trainer)
     }
+
+    /// Patches of where the networks are wrong on faces of units that come after those learned from; with a work folder, a manifest of
+    /// them is left there.
+    fn mined(&self, coarse: &Network, fine: impl Iterator<Item = Network>) -> Result<Vec<Patch>, TrainError> {
+        let settings = self.settings;
+        let first = settings.first_unit + settings.units;
+        let fine: Vec<Engine> = fine.map(Engine::from).collect();
+        let (patches, manifest): (_, Vec<Mined>) = mine(
+            &coarse.clone().into(),
+            &fine,
+            first..first + settings.mining_faces,
+            &|done| self.progress.report("mining", done, settings.mining_faces, None),
+        )?;
+        if let Some(folder) = &settings.work {
+            let lines = manifest.iter().map(|m| json!(m).to_string() + "\n");
+            geometry::write_aside(&folder.join("mined.jsonl"), lines.collect::<String>().as_bytes())?;
+        }
+        Ok(patches)
+    }
 }
 
 /// The settings that decide what a network learns, without those that only say where or when.
@@ -483,16 +520,21 @@ fn name_hash(name: &str) -> u64 {
     hash(&name.bytes().map(u64::from).collect::<Vec<_>>())
 }
 
-/// Indices of patches by pool, those of the pictures from elsewhere after the others, with each pool's share of a batch.
-fn pools(patches: &[Patch], pictured: &[Patch], stage: Stage) -> Vec<(f64, Vec<usize>)> {
-    let mut pools: Vec<(f64, Vec<usize>)> = Pool::ALL
-        .iter()
-        .map(|&pool| {
-            let members = (0..patches.len()).filter(|&i| Pool::of(&patches[i]) == pool).collect();
-            (pool.share(stage), members)
-        })
-        .collect();
-    pools.push((PICTURED, (patches.len()..patches.len() + pictured.len()).collect()));
+/// Indices of patches by pool, with each pool's share of a batch: the first patches by what they are for, the others whole.
+fn pools(all: &[(f64, &[Patch])], stage: Stage) -> Vec<(f64, Vec<usize>)> {
+    let mut begin = 0;
+    let mut pools: Vec<(f64, Vec<usize>)> = Vec::new();
+    for (k, &(weight, patches)) in all.iter().enumerate() {
+        if k == 0 {
+            pools.extend(Pool::ALL.map(|pool| {
+                let members = (0..patches.len()).filter(|&i| Pool::of(&patches[i]) == pool).collect();
+                (weight * pool.share(stage), members)
+            }));
+        } else {
+            pools.push((weight, (begin..begin + patches.len()).collect()));
+        }
+        begin += patches.len();
+    }
     pools.retain(|p| !p.1.is_empty());
     pools
 }

@@ -5,7 +5,7 @@ use crate::samples::{PATCH_PX, Patch, only, rendered};
 use crate::train::{Lesson, Progress, TUNING_SEEDS, TrainError, TrainSettings};
 use crate::{pictures, real};
 use geometry::{Pixel, RgbImage};
-use nn::{Network, Spec, Trainer};
+use nn::{Engine, NnError, Spec, Trainer};
 use serde::Serialize;
 use std::{collections::BTreeMap, ops::Range, path::Path, time::Instant};
 use vision::layout::Class;
@@ -50,8 +50,7 @@ pub fn try_network(
             work: None,
             ..settings.clone()
         },
-        patches: &patches,
-        pictured: &[],
+        pools: vec![(1.0, &patches)],
         progress,
     };
     let begin = Instant::now();
@@ -64,7 +63,7 @@ pub fn try_network(
     Ok(Trial {
         loss: losses.get("trial").copied().unwrap_or(f32::NAN),
         train_s,
-        ..judged(&[trainer.network()], &unseen)
+        ..judged(&[trainer.network().into()], &unseen)?
     })
 }
 
@@ -72,25 +71,21 @@ pub fn try_network(
 ///
 /// # Errors
 /// As [`train`](crate::train()), for the work folder.
-pub fn measure_networks(
-    networks: &[Network],
-    units: Range<u64>,
-    settings: &TrainSettings,
-) -> Result<Trial, TrainError> {
+pub fn measure_networks(networks: &[Engine], units: Range<u64>, settings: &TrainSettings) -> Result<Trial, TrainError> {
     let patches = rendered(units, settings.background, settings.work.as_deref(), &|_| {})?;
-    Ok(judged(networks, &patches))
+    Ok(judged(networks, &patches)?)
 }
 
 /// The same on a folder of pictures with exact truth (see `pictures.rs`).
 ///
 /// # Errors
 /// [`TrainError`] that names the file.
-pub fn measure_networks_on_pictures(networks: &[Network], folder: &Path) -> Result<Trial, TrainError> {
+pub fn measure_networks_on_pictures(networks: &[Engine], folder: &Path) -> Result<Trial, TrainError> {
     let (patches, _) = pictures::patches(folder, 0)?;
-    Ok(judged(networks, &patches))
+    Ok(judged(networks, &patches)?)
 }
 
-fn judged(networks: &[Network], patches: &[Patch]) -> Trial {
+fn judged(networks: &[Engine], patches: &[Patch]) -> Result<Trial, NnError> {
     let (mut screws, mut others, mut errors) = (Vec::new(), Vec::new(), Vec::new());
     let (mut drives, mut right) = (0, 0);
     for patch in patches {
@@ -101,7 +96,7 @@ fn judged(networks: &[Network], patches: &[Patch]) -> Trial {
         let middle = PATCH_PX as f64 / 2.0;
         // stage 1 is off by a few pixels
         let place = label.map_or([middle; 2], |l| [f64::from(l.u_px) + 2.0, f64::from(l.v_px) - 2.0]);
-        let Some(found) = vision::look(networks, &picture, &[Pixel::new(place[0], place[1])]).pop() else {
+        let Some(found) = vision::look(networks, &picture, &[Pixel::new(place[0], place[1])])?.pop() else {
             continue;
         };
         let score = f64::from(found.of(Class::Cross));
@@ -135,7 +130,7 @@ fn judged(networks: &[Network], patches: &[Patch]) -> Trial {
     let part = |hits: usize, of: usize| hits as f64 / of.max(1) as f64;
     let sure = |p: &f64| -p.max(1e-6).ln();
     let log_loss = screws.iter().map(sure).sum::<f64>() + others.iter().map(|p| sure(&(1.0 - p))).sum::<f64>();
-    Trial {
+    Ok(Trial {
         loss: f32::NAN,
         train_s: 0.0,
         screws: screws.len(),
@@ -144,5 +139,5 @@ fn judged(networks: &[Network], patches: &[Patch]) -> Trial {
         log_loss: log_loss / (screws.len() + others.len()).max(1) as f64,
         drive_right: part(right, drives),
         center_px: [at(&errors, 0.5), at(&errors, 0.95)],
-    }
+    })
 }

@@ -3,6 +3,7 @@
 use crate::face::{Shot, face_of, shot};
 use geometry::Pixel;
 use nalgebra::{Matrix3, Vector3};
+use nn::NnError;
 use scene::Unit;
 use serde::{Deserialize, Serialize};
 use vision::layout::Class;
@@ -47,14 +48,17 @@ pub struct Tuning {
 }
 
 /// Chooses thresholds, sigma factors and the scores' calibration on `faces` rendered faces from `first_seed` on.
-pub fn tune(model: &Model, first_seed: u64, faces: u64, done: &dyn Fn(u64)) -> Tuning {
+///
+/// # Errors
+/// [`NnError`] where an engine from outside fails.
+pub fn tune(model: &Model, first_seed: u64, faces: u64, done: &dyn Fn(u64)) -> Result<Tuning, NnError> {
     let mut shots = (first_seed..first_seed + faces).filter_map(|seed| {
         done(seed - first_seed + 1);
         shot(&Unit::sample(seed), face_of(seed), seed)
     });
     let kept: Vec<Shot> = shots.by_ref().take(CUE_FACES).collect();
     let mut corrections = Corrections::default();
-    cue_factors(model, &kept, &mut corrections);
+    cue_factors(model, &kept, &mut corrections)?;
     // every candidate speaks, uncalibrated: what they say is what is calibrated
     let open = Settings {
         thresholds: Thresholds {
@@ -119,7 +123,7 @@ pub fn tune(model: &Model, first_seed: u64, faces: u64, done: &dyn Fn(u64)) -> T
     }
     // with scores that are probabilities, least expected cost is a matter of the costs alone
     let (accept, review) = (1.0 - LOOK / FALSE_FIND, LOOK / MISS);
-    Tuning {
+    Ok(Tuning {
         thresholds: Thresholds {
             accept: accept as f32,
             review: review as f32,
@@ -130,7 +134,7 @@ pub fn tune(model: &Model, first_seed: u64, faces: u64, done: &dyn Fn(u64)) -> T
         screws,
         without_candidate: unfound,
         cost_a_face: (cost(&scores, accept, review) + MISS * unfound as f64) / faces.max(1) as f64,
-    }
+    })
 }
 
 struct DepthError {
@@ -179,15 +183,15 @@ struct CueError {
 }
 
 /// Each cue alone against truth, from where a detection starts it.
-fn cue_factors(model: &Model, shots: &[Shot], corrections: &mut Corrections) {
+fn cue_factors(model: &Model, shots: &[Shot], corrections: &mut Corrections) -> Result<(), NnError> {
     let mut cues: [Vec<CueError>; 3] = Default::default();
     for shot in shots {
         let picture = &shot.frame.color;
-        let places: Vec<_> = candidates(&coarse_map(&model.coarse, picture), &model.settings.thresholds)
+        let places: Vec<_> = candidates(&coarse_map(&model.coarse, picture)?, &model.settings.thresholds)
             .iter()
             .map(|c| c.pixel)
             .collect();
-        let evidence = look(&model.fine, picture, &places);
+        let evidence = look(&model.fine, picture, &places)?;
         let at = |e: &Evidence| Pixel::new(e.center.u_px, e.center.v_px);
         let detectable = shot.truth.screws.iter().filter(|s| s.detectable);
         let found: Vec<_> = detectable
@@ -235,6 +239,7 @@ fn cue_factors(model: &Model, shots: &[Shot], corrections: &mut Corrections) {
     }
     (corrections.learned_sigma, corrections.cross_sigma) =
         (one_sigma(rest(0, &|e| e.sigma_px)), one_sigma(rest(2, &|e| e.sigma_px)));
+    Ok(())
 }
 
 /// How far below the rim a cue rests, in head diameters: least squares over all but the gross errors.

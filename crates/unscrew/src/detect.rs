@@ -1,7 +1,7 @@
 //! `unscrew detect`: the screws in photographs, as a table, as JSON lines or drawn on the picture.
 
 use crate::annotations::{self, Fastener, Format};
-use crate::{Ended, output};
+use crate::{Ended, model::ModelArgs, output};
 use anyhow::{Context, Result, bail};
 use calibration::Map;
 use geometry::{RgbdFrame, read_camera_info, read_rgbd};
@@ -37,9 +37,8 @@ pub struct Args {
     /// Head diameters to look for, px
     #[arg(long, default_value = "20..40", value_name = "MIN..MAX", value_parser = head_range)]
     head_px: RangeInclusive<f64>,
-    /// Model file; left out, the built-in one
-    #[arg(long, value_name = "FILE")]
-    model: Option<PathBuf>,
+    #[command(flatten)]
+    model: ModelArgs,
     /// Write each picture with the finds drawn on it into this folder
     #[arg(long, value_name = "DIR")]
     overlay: Option<PathBuf>,
@@ -102,10 +101,7 @@ pub fn run(args: &Args) -> Result<Ended> {
     if args.map.is_some() && (args.camera.is_none() || args.depth.is_empty()) {
         bail!("--map needs --depth and --camera: without them there is no point in space to map");
     }
-    let detector = match &args.model {
-        Some(path) => Detector::load(path)?,
-        None => Detector::embedded()?,
-    };
+    let detector = args.model.detector()?;
     if let Some(path) = &args.camera {
         read_camera_info(path)?; // a bad camera file is said before any picture is worked on
     }

@@ -1,7 +1,7 @@
 //! `unscrew evaluate`: what the detector is worth, with bounds: on rendered faces, on pictures with exact truth, on photographs,
 //! on crops.
 
-use crate::{Ended, detect::head_range, output};
+use crate::{Ended, detect::head_range, model::ModelArgs, output};
 use anyhow::{Result, bail};
 use serde::Serialize;
 use std::{
@@ -14,7 +14,7 @@ use std::{
 use training::{
     EvaluateError, Evaluator, FIRST_EVALUATION_SEED, Product, evaluate_crops, evaluate_photographs, truth_files,
 };
-use vision::{Detector, Options};
+use vision::Options;
 
 /// Measures the detector: recall, precision and centre error with 95 % bounds, by wear and by what may be taken for a screw.
 ///
@@ -46,9 +46,8 @@ pub struct Args {
     /// Only the photographs of these scenes
     #[arg(long, value_name = "NAME", num_args = 1.., requires = "photos")]
     scene: Vec<String>,
-    /// Model file; left out, the built-in one
-    #[arg(long, value_name = "FILE")]
-    model: Option<PathBuf>,
+    #[command(flatten)]
+    model: ModelArgs,
     /// Head diameters to look for, px; left out, 20..40, and 15..80 in photographs
     #[arg(long, value_name = "MIN..MAX", value_parser = head_range)]
     head_px: Option<RangeInclusive<f64>>,
@@ -64,10 +63,7 @@ pub struct Args {
 }
 
 pub fn run(args: &Args) -> Result<Ended> {
-    let detector = match &args.model {
-        Some(path) => Detector::load(path)?,
-        None => Detector::embedded()?,
-    };
+    let detector = args.model.detector()?;
     for path in [&args.out, &args.plot].into_iter().flatten() {
         let folder = path
             .parent()

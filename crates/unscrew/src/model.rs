@@ -1,17 +1,60 @@
-//! `unscrew model`: a model's networks as ONNX files, and a model from such files.
+//! The model that a command runs; and `unscrew model`: its networks as ONNX files, and a model from such files.
 
 use crate::{Ended, output};
 use anyhow::{Context, Result};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use vision::{Settings, decode_model, encode_model};
+use vision::{Detector, Settings, decode_model, encode_model};
+
+/// Which model finds, and what runs its networks.
+#[derive(clap::Args)]
+pub(crate) struct ModelArgs {
+    /// Model file; left out, the built-in one
+    #[arg(long, value_name = "FILE")]
+    model: Option<PathBuf>,
+    /// Run its networks by ONNX Runtime, the library that ORT_DYLIB_PATH names, instead of by the built-in kernels
+    #[cfg(feature = "ort")]
+    #[arg(long, value_enum, value_name = "PROVIDER")]
+    onnx_runtime: Option<Provider>,
+}
+
+/// What computes in ONNX Runtime.
+#[cfg(feature = "ort")]
+#[derive(Clone, Copy, clap::ValueEnum)]
+enum Provider {
+    /// The processor
+    Cpu,
+    /// The first NVIDIA GPU
+    Cuda,
+}
+
+impl ModelArgs {
+    /// The detector that they ask for.
+    pub(crate) fn detector(&self) -> Result<Detector> {
+        let detector = match &self.model {
+            Some(path) => Detector::load(path)?,
+            None => Detector::embedded()?,
+        };
+        #[cfg(feature = "ort")]
+        if let Some(provider) = self.onnx_runtime {
+            let provider = match provider {
+                Provider::Cpu => nn::onnx_runtime::Provider::Cpu,
+                Provider::Cuda => nn::onnx_runtime::Provider::Cuda,
+            };
+            let model = detector.model().clone().through_onnx_runtime(provider)?;
+            return Ok(Detector::new(model));
+        }
+        Ok(detector)
+    }
+}
 
 /// What to do with a model.
 #[derive(clap::Subcommand)]
 pub enum Command {
     /// Write each network as an ONNX file, for other programs to run.
     Export(Export),
-    /// Make a model from ONNX files: one chain of convolutions each, with the inputs and outputs of `vision::layout`.
+    /// Make a model from ONNX files: one chain of convolutions each, with the inputs and outputs of `vision::layout` (any graph, where
+    /// built with the feature `ort`).
     Import(Import),
 }
 
@@ -92,7 +135,12 @@ fn import(args: &Import) -> Result<Ended> {
     let read = |path: &PathBuf| -> Result<Vec<u8>> {
         let name = path.display();
         let bytes = std::fs::read(path).with_context(|| format!("reading {name}"))?;
-        nn::onnx::import(&bytes).with_context(|| format!("reading {name}"))
+        let chain = nn::onnx::import(&bytes);
+        // what the own kernels cannot run goes into the model as it is
+        if cfg!(feature = "ort") && matches!(chain, Err(nn::NnError::Onnx(_))) {
+            return Ok(bytes);
+        }
+        chain.with_context(|| format!("reading {name}"))
     };
     let (mut coarse, mut fine, mut settings) = networks(args.model.as_deref())?;
     if let Some(path) = &args.coarse {
@@ -104,7 +152,7 @@ fn import(args: &Import) -> Result<Ended> {
     let files: Vec<&PathBuf> = args.coarse.iter().chain(&args.fine).collect();
     settings.facts = BTreeMap::from([("imported".into(), serde_json::json!(files))]);
     let bytes = encode_model(&coarse, &fine, &settings)?;
-    vision::Detector::from_bytes(&bytes)?; // inputs and outputs are what detection expects
+    Detector::from_bytes(&bytes)?; // inputs and outputs are what detection expects
     geometry::write_aside(&args.out, &bytes)?;
     println!("{} ({})", args.out.display(), vision::model_id(&bytes));
     Ok(Ended::Good)

@@ -2,7 +2,9 @@
 
 use crate::calibrate::Visits;
 use crate::{
-    Ended, output,
+    Ended,
+    model::ModelArgs,
+    output,
     report::{self, Missed, Report},
     stats,
 };
@@ -29,7 +31,6 @@ use std::{
     },
     time::Instant,
 };
-use vision::Detector;
 
 /// Takes units apart: finds their screws, maps them into the robot's base, takes them out, pulls the covers.
 #[derive(clap::Args)]
@@ -55,9 +56,8 @@ pub struct Args {
     maps: PathBuf,
     #[command(flatten)]
     visits: Visits,
-    /// Model file; left out, the built-in one
-    #[arg(long, value_name = "FILE")]
-    model: Option<PathBuf>,
+    #[command(flatten)]
+    model: ModelArgs,
     /// Print the summary as JSON
     #[arg(long)]
     json: bool,
@@ -79,10 +79,7 @@ pub fn run(args: &Args) -> Result<Ended> {
         Some(path) => CellConfig::read(path)?,
         None => CellConfig::simulated(),
     };
-    let detector = match &args.model {
-        Some(path) => Detector::load(path)?,
-        None => Detector::embedded()?,
-    };
+    let detector = args.model.detector()?;
     let Backend::Simulated = config.backend;
     let settings = SimSettings {
         units_seed: args.seed,

@@ -39,15 +39,15 @@ pub struct Args {
     /// Steps of the coarse network
     #[arg(long, default_value_t = TrainSettings::default().coarse_steps)]
     coarse_steps: usize,
-    /// Steps of each fine network, those that they share included
+    /// Steps of the fine network
     #[arg(long, default_value_t = TrainSettings::default().fine_steps)]
     fine_steps: usize,
-    /// First steps, which the fine networks share
-    #[arg(long, default_value_t = TrainSettings::default().shared_steps)]
-    shared_steps: usize,
     /// First learning rate
     #[arg(long, default_value_t = TrainSettings::default().learning_rate)]
     learning_rate: f32,
+    /// Faces that the half-trained networks look at, to learn from where they are wrong; --work gets a list of it (mined.jsonl)
+    #[arg(long, default_value_t = TrainSettings::default().mining_faces)]
+    mining_faces: u64,
     /// Faces that set thresholds and sigma factors
     #[arg(long, default_value_t = TrainSettings::default().tuning_faces)]
     tuning_faces: u64,
@@ -97,8 +97,8 @@ pub fn run(args: &Args) -> Result<Ended> {
         units: args.units,
         coarse_steps: args.coarse_steps,
         fine_steps: args.fine_steps,
-        shared_steps: args.shared_steps,
         learning_rate: args.learning_rate,
+        mining_faces: args.mining_faces,
         tuning_faces: args.tuning_faces,
         seed: args.seed,
         data: args.data.clone(),

@@ -2,7 +2,7 @@
 
 use geometry::{Pixel, space};
 use image::RgbImage;
-use nn::Network;
+use nn::{Engine, NnError};
 
 use crate::Thresholds;
 use crate::components::{Run, area, components};
@@ -37,26 +37,29 @@ pub struct ProbabilityMap {
 }
 
 /// Runs the coarse network over a whole picture, in bands of rows without seams.
-pub fn coarse_map(network: &Network, picture: &RgbImage) -> ProbabilityMap {
+///
+/// # Errors
+/// [`NnError`] where an engine from outside fails; the own one does not.
+pub fn coarse_map(network: &Engine, picture: &RgbImage) -> Result<ProbabilityMap, NnError> {
     if picture.width() == 0 || picture.height() == 0 {
-        return ProbabilityMap {
+        return Ok(ProbabilityMap {
             width: 0,
             height: 0,
             probability: Vec::new(),
-        };
+        });
     }
-    let logits = network.forward(&Rows(picture));
+    let logits = network.forward(&Rows(picture))?;
     // Softmax over two channels is the logistic function of their difference.
     let probability = logits
         .data
         .chunks_exact(COARSE_CHANNELS)
         .map(|cell| 1.0 / (1.0 + (cell[1 - COARSE_FASTENER] - cell[COARSE_FASTENER]).exp()))
         .collect();
-    ProbabilityMap {
+    Ok(ProbabilityMap {
         width: logits.w,
         height: logits.h,
         probability,
-    }
+    })
 }
 
 /// Thresholds the map, filters its components by area, and takes their well-separated local maxima.

@@ -7,6 +7,7 @@ use std::time::Instant;
 
 use geometry::{Camera, CameraModel, DepthMap, Direction, Pixel, Point, RgbdFrame};
 use image::RgbImage;
+use nn::NnError;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
@@ -314,9 +315,15 @@ impl Detector {
         let begin = Instant::now();
         let mut timing_ms = Timing::default();
         let mut finds = Vec::new();
+        let mut doubts = doubts(picture, region, &options.head_px);
         for scale in pyramid_scales(&options.head_px) {
             if let Some(level) = self.level(picture, region, scale) {
-                finds.extend(self.find(&level, &mut timing_ms));
+                match self.find(&level, &mut timing_ms) {
+                    Ok(found) => finds.extend(found),
+                    Err(error) => doubts.push(Doubt::NotSeen {
+                        reason: error.to_string(),
+                    }),
+                }
             }
         }
         let heads = options.head_px.start() / HEAD_TOLERANCE..=options.head_px.end() * HEAD_TOLERANCE;
@@ -334,7 +341,6 @@ impl Detector {
                 Some(Screw { normal, ..screw })
             })
             .collect();
-        let doubts = doubts(picture, region, &options.head_px);
         if !doubts.is_empty() {
             let acted_on = screws.iter_mut().filter(|s| s.verdict == Verdict::Screw);
             acted_on.for_each(|s| s.verdict = Verdict::Review);
@@ -364,7 +370,7 @@ impl Detector {
     /// The region of the picture at a scale, with enough around it that the networks see the same as in the whole picture.
     fn level<'a>(&self, picture: &'a RgbImage, region: Region, scale: f64) -> Option<Level<'a>> {
         let (width, height) = picture.dimensions();
-        let seen = self.model.coarse.spec().receptive_field().max(CLIP_PX);
+        let seen = self.model.coarse.receptive_field().unwrap_or(2 * CLIP_PX).max(CLIP_PX);
         let margin = (seen as f64 / scale).ceil() as u32;
         // Cells of the part coincide with cells of the whole where the scale is 1.
         let low = |c: u32| c.saturating_sub(margin) / STRIDE as u32 * STRIDE as u32;
@@ -386,26 +392,24 @@ impl Detector {
     }
 
     /// Both stages on one level.
-    fn find(&self, level: &Level, timing_ms: &mut Timing) -> Vec<Find> {
+    fn find(&self, level: &Level, timing_ms: &mut Timing) -> Result<Vec<Find>, NnError> {
         let start = Instant::now();
-        let map = coarse_map(&self.model.coarse, &level.picture);
+        let map = coarse_map(&self.model.coarse, &level.picture)?;
         let places: Vec<_> = candidates(&map, &self.model.settings.thresholds)
             .iter()
             .map(|c| c.pixel)
             .collect();
         timing_ms.coarse += ms_since(start);
         let start = Instant::now();
-        let evidence = look(&self.model.fine, &level.picture, &places);
+        let evidence = look(&self.model.fine, &level.picture, &places)?;
         timing_ms.fine += ms_since(start);
-        evidence
-            .into_iter()
-            .map(|evidence| Find {
-                pixel: level.to_image(evidence.center),
-                sigma_px: evidence.sigma_px / level.scale,
-                diameter_px: evidence.diameter_px / level.scale,
-                evidence,
-            })
-            .collect()
+        let in_image = |evidence: Evidence| Find {
+            pixel: level.to_image(evidence.center),
+            sigma_px: evidence.sigma_px / level.scale,
+            diameter_px: evidence.diameter_px / level.scale,
+            evidence,
+        };
+        Ok(evidence.into_iter().map(in_image).collect())
     }
 
     /// Verdict, drive and centre of a find; `None` where it is nothing.
@@ -585,8 +589,8 @@ mod tests {
         };
         let level = detector.level(&picture, region, 1.0).expect("inside");
         let (whole, part) = (
-            coarse_map(&detector.model.coarse, &picture),
-            coarse_map(&detector.model.coarse, &level.picture),
+            coarse_map(&detector.model.coarse, &picture).expect("own kernels"),
+            coarse_map(&detector.model.coarse, &level.picture).expect("own kernels"),
         );
         let corner = level.to_image(Pixel::new(0.0, 0.0));
         let (cu, cv) = (corner.u_px as usize / STRIDE, corner.v_px as usize / STRIDE);

@@ -2,7 +2,7 @@
 
 use geometry::{Pixel, space};
 use image::RgbImage;
-use nn::{Network, Tensor, softmax};
+use nn::{Engine, NnError, Tensor, softmax};
 use rayon::prelude::*;
 
 use crate::clip::Clip;
@@ -58,22 +58,28 @@ impl Evidence {
 ///
 /// # Returns
 /// Evidence for each place, in the same order.
-pub fn look(networks: &[Network], picture: &RgbImage, places: &[Pixel<space::Clip>]) -> Vec<Evidence> {
+///
+/// # Errors
+/// [`NnError`] where an engine from outside fails; the own one does not.
+pub fn look(networks: &[Engine], picture: &RgbImage, places: &[Pixel<space::Clip>]) -> Result<Vec<Evidence>, NnError> {
     if picture.width() == 0 || picture.height() == 0 || networks.is_empty() {
-        return Vec::new();
+        return Ok(Vec::new());
     }
-    let mut evidence = look_once(&networks[..1], picture, places, VIEWS[0]);
+    let mut evidence = look_once(&networks[..1], picture, places, VIEWS[0])?;
     let worth: Vec<usize> = (0..evidence.len())
         .filter(|&i| evidence[i].fastener() >= WORTH_MORE)
         .collect();
     let centers: Vec<_> = worth.iter().map(|&i| evidence[i].center).collect();
-    let views = VIEWS.map(|sign| look_once(networks, picture, &centers, sign));
+    let mut views = Vec::with_capacity(VIEWS.len());
+    for sign in VIEWS {
+        views.push(look_once(networks, picture, &centers, sign)?);
+    }
     for (k, &i) in worth.iter().enumerate() {
         // a mirror image may have settled on a neighbour
         let same = |e: &&Evidence| e.center.distance_px(&views[0][k].center) < VOTE_RADIUS * views[0][k].diameter_px;
         evidence[i] = mean(&views.iter().map(|view| &view[k]).filter(same).collect::<Vec<_>>());
     }
-    evidence
+    Ok(evidence)
 }
 
 /// What several looks at one thing say together.
@@ -105,7 +111,12 @@ fn normalized(ln: [f32; CLASSES]) -> [f32; CLASSES] {
     odds.map(|o| o / sum)
 }
 
-fn look_once(networks: &[Network], picture: &RgbImage, places: &[Pixel<space::Clip>], sign: [i64; 2]) -> Vec<Evidence> {
+fn look_once(
+    networks: &[Engine],
+    picture: &RgbImage,
+    places: &[Pixel<space::Clip>],
+    sign: [i64; 2],
+) -> Result<Vec<Evidence>, NnError> {
     let mut evidence = Vec::with_capacity(places.len());
     for places in places.chunks(BATCH) {
         let clips: Vec<Clip> = places.iter().map(|&p| Clip::mirrored(picture, p, sign)).collect();
@@ -118,11 +129,11 @@ fn look_once(networks: &[Network], picture: &RgbImage, places: &[Pixel<space::Cl
         let maps: Vec<Tensor> = networks
             .iter()
             .map(|network| {
-                let mut map = network.forward_batch(&batch);
+                let mut map = network.forward_batch(&batch)?;
                 softmax(&mut map, CLASS_CHANNELS);
-                map
+                Ok(map)
             })
-            .collect();
+            .collect::<Result<_, NnError>>()?;
         evidence.par_extend(clips.par_iter().zip(places).enumerate().map(|(n, (clip, &place))| {
             let maps: Vec<&[f32]> = maps
                 .iter()
@@ -135,7 +146,7 @@ fn look_once(networks: &[Network], picture: &RgbImage, places: &[Pixel<space::Cl
             }
         }));
     }
-    evidence
+    Ok(evidence)
 }
 
 /// One cell's opinion about where the centre is, clip px.

@@ -1,7 +1,7 @@
 //! What the networks see and what their outputs mean: the one place that training and detection share.
 //!
-//! Both networks answer at every fourth pixel: output cell `i` speaks of input pixel `4 * i` (the fine one halves once more and
-//! enlarges at its end; it has learned the half cell by which that is off).
+//! Both networks answer at every fourth pixel: output cell `i` speaks of input pixel `4 * i` (they halve once more and enlarge
+//! at their end; they have learned the half cell by which that is off).
 //!
 //! | network | input | output channels |
 //! |---|---|---|
@@ -112,7 +112,8 @@ pub fn cell_center_px(i: usize) -> f64 {
     (i * STRIDE) as f64
 }
 
-/// The coarse network unless a model file says otherwise: sees 81 x 81 pixels, 45 GFLOP for 12 megapixels.
+/// The coarse network unless a model file says otherwise: sees 89 x 89 pixels, most of its layers an eighth of the picture's size;
+/// 26 GFLOP for 12 megapixels.
 pub fn coarse_spec() -> Spec {
     let conv = LayerSpec::conv;
     Spec {
@@ -120,26 +121,29 @@ pub fn coarse_spec() -> Spec {
         layers: vec![
             conv(5, 2, 1, 16),
             conv(3, 2, 1, 24),
-            conv(3, 1, 1, 24),
-            conv(3, 1, 2, 24),
-            conv(3, 1, 2, 24),
-            conv(3, 1, 4, 24),
+            conv(3, 2, 1, 32),
+            conv(3, 1, 1, 32),
+            conv(3, 1, 1, 32),
+            conv(3, 1, 2, 32),
+            LayerSpec::Upsample2,
             LayerSpec::output(COARSE_CHANNELS),
         ],
     }
 }
 
-/// Each of the three fine networks unless a model file says otherwise: a cell sees 71 x 71 pixels.
+/// Each of the fine networks unless a model file says otherwise: a cell sees 91 x 91 pixels, the whole clip from its middle.
 pub fn fine_spec() -> Spec {
     let conv = LayerSpec::conv;
     Spec {
         input_channels: FINE_INPUT_CHANNELS,
         layers: vec![
             conv(3, 2, 1, 32),
+            conv(3, 1, 1, 32),
             conv(3, 2, 1, 64),
             conv(3, 1, 1, 64),
             conv(3, 1, 1, 64),
             conv(3, 2, 1, 128),
+            conv(3, 1, 1, 128),
             conv(3, 1, 1, 128),
             conv(3, 1, 1, 128),
             LayerSpec::Upsample2,
@@ -158,12 +162,12 @@ mod tests {
         coarse.check().expect("coarse spec");
         fine.check().expect("fine spec");
         assert_eq!((coarse.stride(), fine.stride()), (STRIDE, STRIDE));
-        assert_eq!(coarse.pixel_map(), (4.0, 0.0));
+        assert_eq!((coarse.pixel_map(), fine.pixel_map()), ((4.0, -2.0), (4.0, -2.0)));
         assert_eq!(fine.output_size(CLIP_PX, CLIP_PX), (MAP_CELLS, MAP_CELLS));
         assert_eq!(coarse.output_channels(), COARSE_CHANNELS);
         assert_eq!(fine.output_channels(), FINE_CHANNELS);
-        assert_eq!((coarse.receptive_field(), fine.receptive_field()), (81, 71));
-        assert!(coarse.flops(3006, 4104) < 60_000_000_000);
+        assert_eq!((coarse.receptive_field(), fine.receptive_field()), (89, 91));
+        assert!(coarse.flops(3006, 4104) < 27_000_000_000);
         assert_eq!(cell_center_px(8), CLIP_CENTER_PX as f64);
         assert_eq!(Class::ALL.map(Class::channel), [0, 1, 2, 3, 4, 5, 6]);
     }

@@ -1,15 +1,16 @@
-//! The model file: the coarse network, the three fine ones, and the figures that training measured, in one file.
+//! The model file: the coarse network, the fine ones, and the figures that training measured, in one file.
 //!
 //! `UNSCREW1`, the length of the header (u32, little endian), the header (JSON), then the networks' bytes one after the other, as
-//! the header lists them. Each network is a safetensors file with its own architecture.
+//! the header lists them. Each network is a safetensors file with its own architecture, or
+//! an ONNX graph for whoever has ONNX Runtime.
 
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use nn::{Network, NnError};
+use nn::{Engine, NnError};
 use serde::{Deserialize, Serialize};
 
-use crate::layout::{CLIP_PX, COARSE_CHANNELS, FINE_CHANNELS, FINE_INPUT_CHANNELS, STRIDE};
+use crate::layout::{COARSE_CHANNELS, FINE_CHANNELS, FINE_INPUT_CHANNELS, STRIDE};
 
 const MAGIC: &[u8; 7] = b"UNSCREW";
 /// Version of the container, the eighth byte of the file.
@@ -173,7 +174,7 @@ pub enum ModelError {
         reason: String,
     },
     /// A network in it cannot be used.
-    #[error("network {network} of the model {file}: {source}; train the model again")]
+    #[error("network {network} of the model {file}: {source}")]
     Network {
         /// The file.
         file: String,
@@ -198,9 +199,9 @@ pub enum ModelError {
 #[derive(Clone, Debug)]
 pub struct Model {
     /// Stage 1: whole picture to candidates.
-    pub coarse: Network,
-    /// Stage 2: the ensemble whose mean decides (three networks in the paper).
-    pub fine: Vec<Network>,
+    pub coarse: Engine,
+    /// Stage 2: one network, or several whose mean decides (three in the paper).
+    pub fine: Vec<Engine>,
     /// Thresholds, corrections, facts.
     pub settings: Settings,
     id: String,
@@ -241,7 +242,7 @@ impl Model {
         for entry in header.networks {
             let (blob, tail) = rest.split_at(entry.bytes); // `split` checked the sum
             rest = tail;
-            let network = Network::from_bytes(blob).map_err(|source| ModelError::Network {
+            let network = Engine::from_bytes(blob).map_err(|source| ModelError::Network {
                 file: file.into(),
                 network: entry.name.clone(),
                 source,
@@ -275,6 +276,31 @@ impl Model {
                 reason: "it lists no coarse network or no fine one".into(),
             }),
         }
+    }
+
+    /// The same model with its networks run by ONNX Runtime.
+    ///
+    /// # Errors
+    /// [`ModelError::Network`] where the library or the provider is not there.
+    #[cfg(feature = "ort")]
+    pub fn through_onnx_runtime(self, provider: nn::onnx_runtime::Provider) -> Result<Self, ModelError> {
+        let moved = |network: String, engine: Engine| match engine {
+            Engine::Own(own) => own
+                .through_onnx_runtime(provider)
+                .map(Engine::OnnxRuntime)
+                .map_err(|source| ModelError::Network {
+                    file: self.id.clone(),
+                    network,
+                    source,
+                }),
+            there => Ok(there),
+        };
+        let coarse = moved("coarse".into(), self.coarse)?;
+        let fine = self.fine.into_iter().enumerate();
+        let fine = fine
+            .map(|(k, engine)| moved(format!("fine{k}"), engine))
+            .collect::<Result<_, _>>()?;
+        Ok(Self { coarse, fine, ..self })
     }
 
     /// `sha256:` and the hash of the file: names the model in every result.
@@ -367,19 +393,15 @@ fn split<'a>(bytes: &'a [u8], file: &str) -> Result<(Header, &'a [u8]), ModelErr
     Ok((header, &bytes[end..]))
 }
 
-fn check_shape(network: &Network, inputs: usize, outputs: usize) -> Result<(), String> {
-    let spec = network.spec();
-    if spec.input_channels != inputs || spec.output_channels() != outputs {
+fn check_shape(network: &Engine, inputs: usize, outputs: usize) -> Result<(), String> {
+    if network.inputs() != inputs || network.outputs() != outputs {
         return Err(format!(
             "has {} input and {} output channels, expected are {inputs} and {outputs}",
-            spec.input_channels,
-            spec.output_channels()
+            network.inputs(),
+            network.outputs()
         ));
     }
-    let cells = CLIP_PX / STRIDE;
-    // a network that ends with an enlargement has its cells half a cell off, and learns to answer for where they should be
-    let (scale, offset) = spec.pixel_map();
-    if scale != STRIDE as f64 || offset.abs() > 0.5 * scale || spec.output_size(CLIP_PX, CLIP_PX) != (cells, cells) {
+    if network.stride() != Some(STRIDE) {
         return Err(format!("does not have one output on every {STRIDE}th pixel"));
     }
     Ok(())
@@ -396,10 +418,11 @@ mod tests {
     #[test]
     fn the_built_in_model_loads_and_survives_a_round_trip() -> Result<(), ModelError> {
         let model = Model::embedded()?;
-        assert_eq!(model.fine.len(), 3);
         assert!(model.id().starts_with("sha256:") && model.id().len() == 71);
         let (networks, settings) = decode_model(EMBEDDED_MODEL, "m.unscrew")?;
-        let fine = [0, 1, 2].map(|i| networks[&format!("fine{i}")].clone());
+        let fine: Vec<_> = (0..model.fine.len())
+            .map(|i| networks[&format!("fine{i}")].clone())
+            .collect();
         let again = encode_model(&networks["coarse"], &fine, &settings)?;
         assert_eq!(Model::from_bytes(&again)?.settings, model.settings);
         assert_eq!(model_id(&again).len(), 71);

@@ -31,7 +31,7 @@ const BLACK: u8 = 6;
 const CLIPPED_LIMIT: f64 = 0.6;
 
 /// Why nothing in a picture is to be acted on: a person should look at it, or take another.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", tag = "why")]
 pub enum Doubt {
     /// Even its sharpest edges are blurred.
@@ -50,6 +50,11 @@ pub enum Doubt {
     UnderExposed {
         /// Share of its pixels, 0 to 1.
         share: f64,
+    },
+    /// The networks could not be run on it: what is listed is not all.
+    NotSeen {
+        /// What their engine says.
+        reason: String,
     },
 }
 
@@ -70,6 +75,7 @@ impl fmt::Display for Doubt {
                 "too dark to be trusted: {:.0} % of it is black beyond telling; expose it more",
                 100.0 * share
             ),
+            Doubt::NotSeen { reason } => write!(f, "not looked at: {reason}"),
         }
     }
 }

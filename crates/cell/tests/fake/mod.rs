@@ -298,14 +298,16 @@ impl DepthCamera for FakeDepth {
 }
 
 impl Finder for Fake {
-    fn find(&self, frame: &RgbdFrame, odds: f64) -> Vec<vision::Screw> {
+    fn find(&self, frame: &RgbdFrame, odds: f64) -> Result<Vec<vision::Screw>, DeviceError> {
         let world = self.world();
         let tilt = world.tilt_rad.get(&world.presented).copied().unwrap_or(0.0);
         let lean = world.lean_rad.get(&world.presented).copied().unwrap_or(0.0);
-        let Some(part) = frame.camera else { return Vec::new() };
+        let Some(part) = frame.camera else {
+            return Ok(Vec::new());
+        };
         let fits = 0.95 * odds / (0.95 * odds + 0.05);
         let heads = world.faces.get(&world.presented).cloned().unwrap_or_default();
-        heads
+        let screws = heads
             .iter()
             .filter(|h| h.stands)
             .filter_map(|head| {
@@ -328,7 +330,8 @@ impl Finder for Fake {
                     sigma_depth_mm: Some(0.1),
                 })
             })
-            .collect()
+            .collect();
+        Ok(screws)
     }
     fn model(&self) -> String {
         "fake".into()

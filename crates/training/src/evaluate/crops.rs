@@ -38,7 +38,7 @@ pub fn evaluate_crops(detector: &Detector, data: &Path) -> Result<CropEvaluation
             continue;
         };
         let place = Pixel::new(f64::from(label.u_px), f64::from(label.v_px));
-        let evidence = look(&detector.model().fine, &picture, &[place]);
+        let evidence = look(&detector.model().fine, &picture, &[place])?;
         let called = evidence.iter().any(|e| e.fastener() >= 0.5);
         if label.classes == any_fastener() {
             fasteners.add(called);

@@ -270,8 +270,7 @@ impl<'a> Evaluator<'a> {
             return Ok(()); // a unit without that face
         };
         let truth = Truth::of_face(format!("{seed} {}", face.name()), face.name(), &truth);
-        self.measure(&frame, &truth);
-        Ok(())
+        self.measure(&frame, &truth)
     }
 
     /// Measures on one picture of a folder with exact truth; `path` is one of [`truth_files`].
@@ -281,24 +280,24 @@ impl<'a> Evaluator<'a> {
     pub fn truth_file(&mut self, folder: &Path, path: &Path) -> Result<(), EvaluateError> {
         let (frame, truth) = read_truth(folder, path)?;
         self.source = format!("pictures of {}", folder.display());
-        self.measure(&frame, &truth);
-        Ok(())
+        self.measure(&frame, &truth)
     }
 
-    fn measure(&mut self, frame: &RgbdFrame, truth: &Truth) {
+    fn measure(&mut self, frame: &RgbdFrame, truth: &Truth) -> Result<(), EvaluateError> {
         let found = self.detector.detect(frame, self.options);
         let head_px = &self.options.head_px;
         let one_scale = TRAINED_HEAD_PX.contains(head_px.start()) && TRAINED_HEAD_PX.contains(head_px.end());
         // at one scale the network's pixels are the picture's
+        let model = self.detector.model();
+        let map = coarse_map(&model.coarse, &frame.color)?;
         let places = one_scale.then(|| {
-            let model = self.detector.model();
-            let map = coarse_map(&model.coarse, &frame.color);
             candidates(&map, &model.settings.thresholds)
                 .iter()
                 .map(|c| Pixel::new(c.pixel.u_px, c.pixel.v_px))
                 .collect::<Vec<Pixel>>()
         });
         self.tally.add(truth, &found, places.as_deref());
+        Ok(())
     }
 
     /// Pictures measured on so far.

@@ -60,6 +60,9 @@ pub enum EvaluateError {
     /// The training data's folder.
     #[error(transparent)]
     Data(#[from] TrainError),
+    /// An engine from outside that fails.
+    #[error(transparent)]
+    Engine(#[from] nn::NnError),
     /// A folder without anything to measure on.
     #[error("nothing to evaluate in {path}: {reason}")]
     Nothing {
