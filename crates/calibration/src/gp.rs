@@ -21,8 +21,8 @@ pub(crate) const MOST_POINTS: usize = 400;
 const MAX_SCORE: f64 = 4.0;
 /// Rounds of rejection.
 const ROUNDS: usize = 6;
-/// A map that is as sure as this is sure enough, however well the camera measures, mm.
-const SURE_MM: f64 = 0.01;
+/// A map that is as sure as this is sure enough, however well the camera measures: a seventh of what the paper reaches, mm.
+const SURE_MM: f64 = 0.05;
 /// Distance of the nodes of the baked correction, mm; of its variance, twice that.
 const NODE_MM: f64 = 40.0;
 /// How far beyond the points the correction is baked, mm.

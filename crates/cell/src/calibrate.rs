@@ -9,6 +9,7 @@ use crate::device::{DeviceError, Devices};
 use crate::removal::Mover;
 use calibration::{Pair, PairError, PairWriter, Target};
 use geometry::{Base, Camera, Direction, Pixel, Point, Transform};
+use image::{RgbImage, imageops::crop_imm};
 use nalgebra::{Isometry3, Matrix3, Rotation3, Translation3, UnitQuaternion, Vector3};
 use std::collections::HashSet;
 use std::path::Path;
@@ -53,6 +54,8 @@ pub struct Visit<'a> {
     pub pair: &'a Pair,
     /// Why there is no measurement, if there is none.
     pub miss: Option<&'a str>,
+    /// What the camera saw around the marker, or where it should have been.
+    pub picture: Option<&'a RgbImage>,
 }
 
 /// What a capture brought.
@@ -128,7 +131,7 @@ pub async fn capture_pairs(
             visit: target.id,
             source,
         };
-        let (pair, miss) = visit(devices, &mover, target, settings, &pairs)
+        let Visited { pair, miss, picture } = visit(devices, &mover, target, settings, &pairs)
             .await
             .map_err(stopped)?;
         writer.append(&pair)?;
@@ -139,6 +142,7 @@ pub async fn capture_pairs(
                 of: plan.len(),
                 pair,
                 miss: miss.as_deref(),
+                picture: picture.as_ref(),
             })
         });
         if !go_on {
@@ -157,13 +161,20 @@ pub async fn capture_pairs(
     })
 }
 
+/// A row, why it holds no measurement if it holds none, and what was seen there.
+struct Visited {
+    pair: Pair,
+    miss: Option<String>,
+    picture: Option<RgbImage>,
+}
+
 async fn visit(
     devices: &Devices,
     mover: &Mover<'_>,
     target: &Target,
     settings: &CaptureSettings,
     before: &[Pair],
-) -> Result<(Pair, Option<String>), DeviceError> {
+) -> Result<Visited, DeviceError> {
     let mut pair = Pair {
         id: target.id,
         node: target.node,
@@ -177,24 +188,34 @@ async fn visit(
     };
     match mover.visit(target.command, settings.approach).await {
         Ok(()) => {}
-        Err(DeviceError::Refused { reason, .. }) => return Ok((pair, Some(format!("out of reach: {reason}")))),
+        Err(DeviceError::Refused { reason, .. }) => {
+            return Ok(Visited {
+                pair,
+                miss: Some(format!("out of reach: {reason}")),
+                picture: None,
+            });
+        }
         Err(error) => return Err(error),
     }
     let state = mover.ready().await?;
     pair.joints_rad = Some(state.joints_rad);
-    let (t_s, seen) = find(devices, target.command, settings, before).await?;
+    let (t_s, seen, picture) = find(devices, target.command, settings, before).await?;
     pair.t_s = t_s;
-    match seen {
+    let miss = match seen {
         Ok((pixel, marker)) => {
             pair.pixel = Some(pixel);
             pair.depth_mm = Some(marker.depth_mm);
             pair.camera = Some(marker.point);
             pair.valid = true;
-            Ok((pair, None))
+            None
         }
-        Err(miss) => Ok((pair, Some(miss.to_string()))),
-    }
+        Err(miss) => Some(miss.to_string()),
+    };
+    Ok(Visited { pair, miss, picture })
 }
+
+/// When it looked, the marker or why there is none, and what is around it.
+type Look = (f64, Result<(Pixel, LocatedMarker), MarkerError>, Option<RgbImage>);
 
 /// Looks for the marker where the earlier rows let it be expected, and in the whole picture if it is not there.
 async fn find(
@@ -202,18 +223,27 @@ async fn find(
     command: Point<Base>,
     settings: &CaptureSettings,
     before: &[Pair],
-) -> Result<(f64, Result<(Pixel, LocatedMarker), MarkerError>), DeviceError> {
+) -> Result<Look, DeviceError> {
     let look = |shot: &Shot| locate_marker(&shot.frame, &settings.marker).map(|m| (shot.to_whole(m.marker.pixel), m));
     let camera = devices.color.intrinsics();
     let expected = predict(command, before).and_then(|point| camera.project(point));
     if let Some(region) = expected.and_then(|pixel| region_around(&camera, pixel, settings.region_px)) {
         let shot = shoot(devices, Some(region), settings.depth_frames).await?;
         if let Ok(seen) = look(&shot) {
-            return Ok((shot.frame.t_s, Ok(seen)));
+            return Ok((shot.frame.t_s, Ok(seen), Some(shot.frame.color)));
         }
     }
     let shot = shoot(devices, None, settings.depth_frames).await?;
-    Ok((shot.frame.t_s, look(&shot)))
+    let seen = look(&shot);
+    let at = seen.as_ref().map(|s| s.0).ok().or(expected);
+    let picture = at.map(|at| {
+        let corner = |c: f64| (c - settings.region_px).max(0.0) as u32;
+        let side = 2 * settings.region_px as u32;
+        // a corner beyond the picture gives what there is, down to nothing
+        crop_imm(&shot.frame.color, corner(at.u_px), corner(at.v_px), side, side).to_image()
+    });
+    let picture = picture.filter(|p| p.width() > 0 && p.height() > 0);
+    Ok((shot.frame.t_s, seen, picture))
 }
 
 /// Where the camera should see a commanded place, by the rigid motion that fits the rows so far. Only to know where to look.

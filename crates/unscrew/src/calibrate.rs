@@ -1,6 +1,6 @@
 //! `unscrew calibrate`: plan, capture, fit, report, apply, verify, export, realign, correct.
 
-use crate::{Ended, diagnosis, output};
+use crate::{Ended, capture_page::Shown, diagnosis, output};
 use anyhow::{Result, bail};
 use calibration::{
     Between, Check, HandEye, Identity, Map, Method, Moved, PlanError, Settings, Target, Volume, diagnose, lattice,
@@ -17,7 +17,9 @@ pub enum Command {
     #[command(after_help = "Example: unscrew calibrate plan --spacing-mm 50 > plan.csv")]
     Plan(Plan),
     /// Drive an arm with the marker over the lattice and write a pair a visit (simulated cell)
-    #[command(after_help = "Example: unscrew calibrate capture --arm arm_a --out pairs_a.csv")]
+    #[command(
+        after_help = "Example: unscrew calibrate capture --arm arm_a --out pairs_a.csv --page capture.html --pictures seen"
+    )]
     Capture(Capture),
     /// Fit a map to pairs
     #[command(after_help = "Example: unscrew calibrate fit pairs_a.csv --out map_a.json")]
@@ -90,6 +92,8 @@ pub struct Capture {
     /// File of pairs; visits that it holds already are not repeated
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
+    #[command(flatten)]
+    shown: Shown,
 }
 
 #[derive(clap::Args)]
@@ -123,6 +127,9 @@ pub struct Report {
     /// Method of the map: gp, lattice, tps, affine or rigid
     #[arg(long, default_value = "gp", value_parser = method)]
     method: Method,
+    /// Folder of what the camera saw at each visit (`calibrate capture --pictures`), to show the pairs that were not believed
+    #[arg(long, value_name = "DIR")]
+    pictures: Option<PathBuf>,
     /// The figures as JSON
     #[arg(long)]
     json: bool,
@@ -287,7 +294,7 @@ fn plan(args: &Plan) -> Result<Ended> {
 }
 
 fn capture(args: &Capture) -> Result<Ended> {
-    let done = crate::run::capture_pairs(args.cell_seed, &args.arm, &args.visits, &args.out)?;
+    let done = crate::run::capture_pairs(args.cell_seed, &args.arm, &args.visits, &args.out, &args.shown)?;
     println!(
         "{}: {} visits, marker found at {}, {:.0} simulated minutes",
         args.out.display(),
@@ -337,7 +344,13 @@ fn report(args: &Report) -> Result<Ended> {
     }
     let (map, found) = diagnose(&pairs, &settings)?;
     let name = args.pairs.file_name().unwrap_or(args.pairs.as_os_str());
-    diagnosis::write(&map, &found, &name.to_string_lossy(), &args.out)?;
+    diagnosis::write(
+        &map,
+        &found,
+        &name.to_string_lossy(),
+        args.pictures.as_deref(),
+        &args.out,
+    )?;
     if args.json {
         println!("{}", serde_json::to_string_pretty(&found)?);
         return Ok(Ended::Good);

@@ -2,10 +2,14 @@
 
 use crate::report::escape;
 use anyhow::{Result, anyhow};
-use calibration::{Diagnosis, Figures, Hull, Judged, Map, volume_covered};
-use geometry::Point;
+use base64::Engine as _;
+use calibration::{Diagnosis, Figures, Hull, Judged, Map, Volume, volume_covered};
+use geometry::{Base, Point};
 use plotters::prelude::*;
-use std::{fmt::Write as _, path::Path};
+use std::{
+    fmt::Write as _,
+    path::{Path, PathBuf},
+};
 
 /// Length of an arrow for each mm of error, mm of the volume.
 const ARROW: f64 = 250.0;
@@ -14,7 +18,7 @@ const CELLS: usize = 40;
 /// Half the thickness of a cut, as a share of the volume's edge: together three cuts show every visit at least once.
 const HALF_CUT: f64 = 0.2;
 
-const STYLE: &str = "
+pub(crate) const STYLE: &str = "
 :root{--ink:#1c2430;--soft:#5b6675;--line:#dfe4ea}body{margin:0;background:#f4f6f8;color:var(--ink);font:15px/1.5 system-ui,'Segoe UI',Roboto,'Noto Sans',sans-serif}
 main{max-width:1180px;margin:0 auto;padding:28px 20px 60px}h1{font-size:26px;margin:0 0 4px}h2{font-size:19px;margin:34px 0 10px}.soft{color:var(--soft)}
 .cards{display:grid;grid-template-columns:repeat(auto-fit,minmax(190px,1fr));gap:12px;margin:18px 0}.card{background:#fff;border:1px solid var(--line);border-radius:8px;padding:14px 16px}
@@ -24,14 +28,17 @@ th{color:var(--soft);font-weight:600}th:first-child,td:first-child{text-align:le
 figure{margin:0;background:#fff;border:1px solid var(--line);border-radius:8px;padding:8px}figure svg{width:100%;height:auto;display:block}figcaption{font-size:13px;color:var(--soft)}";
 
 /// Writes the page, aside and then renamed.
-pub fn write(map: &Map, d: &Diagnosis, source: &str, path: &Path) -> Result<()> {
-    let page = page(map, d, source).map_err(|e| anyhow!("the report cannot be drawn: {e}"))?;
+///
+/// # Arguments
+/// * `pictures` – folder with what was seen at each visit (`calibrate capture --pictures`), to show what was not believed.
+pub fn write(map: &Map, d: &Diagnosis, source: &str, pictures: Option<&Path>, path: &Path) -> Result<()> {
+    let page = page(map, d, source, pictures).map_err(|e| anyhow!("the report cannot be drawn: {e}"))?;
     Ok(geometry::write_aside(path, page.as_bytes())?)
 }
 
-type Drawn = Result<String, Box<dyn std::error::Error>>;
+pub(crate) type Drawn = Result<String, Box<dyn std::error::Error>>;
 
-fn page(map: &Map, d: &Diagnosis, source: &str) -> Drawn {
+fn page(map: &Map, d: &Diagnosis, source: &str, pictures: Option<&Path>) -> Drawn {
     let mut out = String::with_capacity(1 << 16);
     let total = &d.held_out.total;
     write!(
@@ -79,7 +86,7 @@ calibrated. Arrows: errors, {ARROW:.0} times their size. Crosses: rejected pairs
     )?;
     for (across, up, through) in [(1, 2, 0), (0, 2, 1), (0, 1, 2)] {
         out.push_str("<figure>");
-        out.push_str(&cut(map, d, [across, up, through])?);
+        out.push_str(&cut(Some(map), &map.volume(), &d.visits, &[], [across, up, through])?);
         out.push_str("</figure>");
     }
     out.push_str("</div><h2>By region</h2>");
@@ -92,12 +99,16 @@ calibrated. Arrows: errors, {ARROW:.0} times their size. Crosses: rejected pairs
     if d.fit.rejected.is_empty() {
         out.push_str("<p>none</p>");
     } else {
-        out.push_str("<table><tr><th>pair</th><th>off by, mm</th><th>across the ray</th><th>along the ray</th></tr>");
+        out.push_str("<table><tr><th>pair</th><th>off by, mm</th><th>across the ray</th><th>along the ray</th><th>seen</th></tr>");
         for r in &d.fit.rejected {
             write!(
                 out,
-                "<tr><td>{}</td><td>{:.2}</td><td>{:.2}</td><td>{:+.2}</td></tr>",
-                r.id, r.residual_mm, r.lateral_mm, r.depth_mm
+                "<tr><td>{}</td><td>{:.2}</td><td>{:.2}</td><td>{:+.2}</td><td>{}</td></tr>",
+                r.id,
+                r.residual_mm,
+                r.lateral_mm,
+                r.depth_mm,
+                seen(pictures, r.id)
             )?;
         }
         out.push_str("</table>");
@@ -106,15 +117,34 @@ calibrated. Arrows: errors, {ARROW:.0} times their size. Crosses: rejected pairs
     Ok(out)
 }
 
+/// File of what was seen at a visit.
+pub(crate) fn picture_file(folder: &Path, id: u64) -> PathBuf {
+    folder.join(format!("{id:06}.jpg"))
+}
+
+/// The picture of a visit, in the page itself.
+fn seen(folder: Option<&Path>, id: u64) -> String {
+    let jpeg = folder.and_then(|folder| std::fs::read(picture_file(folder, id)).ok());
+    jpeg.map_or_else(String::new, |jpeg| {
+        let data = base64::engine::general_purpose::STANDARD.encode(jpeg);
+        format!("<img alt=\"what the camera saw at visit {id}\" width=\"120\" src=\"data:image/jpeg;base64,{data}\">")
+    })
+}
+
 const AXES: [&str; 3] = ["x", "y", "z"];
 
-/// A cut through the volume: sigma behind, errors before it.
-fn cut(map: &Map, d: &Diagnosis, [across, up, through]: [usize; 3]) -> Drawn {
+/// A cut through the volume: sigma behind, errors before it; grey dots where the marker is still to go.
+pub(crate) fn cut(
+    map: Option<&Map>,
+    volume: &Volume,
+    visits: &[Judged],
+    ahead: &[Point<Base>],
+    [across, up, through]: [usize; 3],
+) -> Drawn {
     let mut svg = String::new();
     {
         let root = SVGBackend::with_string(&mut svg, (420, 420)).into_drawing_area();
         root.fill(&WHITE)?;
-        let volume = map.volume();
         let (low, high) = (volume.at([0.0; 3]).to_array(), volume.at([1.0; 3]).to_array());
         let middle = 0.5 * (low[through] + high[through]);
         let range = |a: usize| {
@@ -127,8 +157,8 @@ fn cut(map: &Map, d: &Diagnosis, [across, up, through]: [usize; 3]) -> Drawn {
             .x_label_area_size(30)
             .y_label_area_size(44)
             .build_cartesian_2d(range(across), range(up))?;
-        let camera_from_base = map.base_from_camera().inverse();
         let cells = (0..CELLS * CELLS).filter_map(|k| {
+            let map = map?;
             let side = |a: usize, k: usize| {
                 let range = range(a);
                 let step = (range.end - range.start) / CELLS as f64;
@@ -137,7 +167,7 @@ fn cut(map: &Map, d: &Diagnosis, [across, up, through]: [usize; 3]) -> Drawn {
             let ((x0, x1), (y0, y1)) = (side(across, k % CELLS), side(up, k / CELLS));
             let mut at = [0.0; 3];
             (at[across], at[up], at[through]) = (0.5 * (x0 + x1), 0.5 * (y0 + y1), middle);
-            let mapped = map.apply(camera_from_base * Point::new(at[0], at[1], at[2]));
+            let mapped = map.apply(map.base_from_camera().inverse() * Point::new(at[0], at[1], at[2]));
             (mapped.hull != Hull::Outside).then(|| {
                 let sigma = mapped.sigma_lateral_mm.hypot(mapped.sigma_depth_mm);
                 let dark = (sigma / 0.4).clamp(0.0, 1.0);
@@ -153,20 +183,25 @@ fn cut(map: &Map, d: &Diagnosis, [across, up, through]: [usize; 3]) -> Drawn {
             .x_desc(format!("{} of the base, mm", AXES[across]))
             .y_desc(AXES[up])
             .draw()?;
-        let near =
-            |v: &&Judged| (v.command.to_array()[through] - middle).abs() <= HALF_CUT * (high[through] - low[through]);
-        for visit in d.visits.iter().filter(near) {
+        let near = |p: [f64; 3]| (p[through] - middle).abs() <= HALF_CUT * (high[through] - low[through]);
+        let still: Vec<_> = ahead.iter().map(|p| p.to_array()).filter(|p| near(*p)).collect();
+        plot.draw_series(
+            still
+                .iter()
+                .map(|p| Circle::new((p[across], p[up]), 1, BLACK.mix(0.35).filled())),
+        )?;
+        for visit in visits.iter().filter(|v| near(v.command.to_array())) {
             let at = visit.command.to_array();
             let place = (at[across], at[up]);
-            if visit.mapped.is_none() {
-                plot.draw_series([Circle::new(place, 4, BLACK.mix(0.5))])?;
-            } else if visit.used {
+            if visit.used {
                 let tip = (
                     place.0 + ARROW * visit.error_mm[across],
                     place.1 + ARROW * visit.error_mm[up],
                 );
                 plot.draw_series([PathElement::new([place, tip], RED.stroke_width(1))])?;
                 plot.draw_series([Circle::new(place, 2, RED.filled())])?;
+            } else if visit.mapped.is_none() {
+                plot.draw_series([Circle::new(place, 4, BLACK.mix(0.5))])?;
             } else {
                 plot.draw_series([Cross::new(place, 5, BLACK.stroke_width(2))])?;
             }

@@ -6,6 +6,7 @@
 mod annotations;
 mod audit;
 mod calibrate;
+mod capture_page;
 mod curve;
 mod detect;
 mod diagnosis;

@@ -3,6 +3,7 @@
 use crate::calibrate::Visits;
 use crate::{
     Ended,
+    capture_page::{CapturePage, Shown},
     model::ModelArgs,
     output,
     report::{self, Missed, Report},
@@ -204,7 +205,7 @@ async fn calibrated(
         let bench = SimulatedCell::new(settings.clone());
         bench.mount_jig(Some(k));
         let started_s = bench.devices.clock.now_s();
-        capture_with(&bench, k, &args.visits, &pairs, stop).await?;
+        capture_with(&bench, k, &args.visits, &pairs, &Shown::default(), stop).await?;
         let minutes = (bench.devices.clock.now_s() - started_s) / 60.0;
         let settings = Settings {
             identity,
@@ -233,13 +234,22 @@ async fn capture_with(
     arm: usize,
     visits: &Visits,
     path: &Path,
+    shown: &Shown,
     stop: &AtomicBool,
 ) -> Result<()> {
     let [low, high] = sim::layout::volume(arm);
-    let plan = visits.over(&Volume::between(low, high))?;
+    let volume = Volume::between(low, high);
+    let plan = visits.over(&volume)?;
     let Some(approach) = Direction::<Base>::new(1.0, 0.0, 0.0) else {
         bail!("the approach has no direction");
     };
+    let before = if path.exists() {
+        read_pairs(path).unwrap_or_default()
+    } else {
+        Vec::new()
+    };
+    let mut page = CapturePage::new(shown, &plan, volume, before)?;
+    let mut unshown = None;
     let bar = output::progress(plan.len() as u64, "calibrating");
     let summary = capture(
         &bench.devices,
@@ -249,11 +259,16 @@ async fn capture_with(
         path,
         |visit| {
             bar.set_position(visit.done as u64);
-            !stop.load(Ordering::SeqCst)
+            unshown = page.add(visit.pair, visit.miss, visit.picture).err();
+            unshown.is_none() && !stop.load(Ordering::SeqCst)
         },
     )
     .await?;
     bar.finish_and_clear();
+    if let Some(error) = unshown {
+        return Err(error);
+    }
+    page.write(true)?;
     if !summary.complete {
         bail!(
             "calibration stopped after {} visits; run again to go on from there",
@@ -271,7 +286,7 @@ pub struct Captured {
 }
 
 /// Captures pairs of one arm of the simulated cell: `unscrew calibrate capture`.
-pub fn capture_pairs(cell_seed: u64, arm: &str, visits: &Visits, path: &Path) -> Result<Captured> {
+pub fn capture_pairs(cell_seed: u64, arm: &str, visits: &Visits, path: &Path, shown: &Shown) -> Result<Captured> {
     let bench = SimulatedCell::new(SimSettings {
         seed: cell_seed,
         ..SimSettings::default()
@@ -286,7 +301,7 @@ pub fn capture_pairs(cell_seed: u64, arm: &str, visits: &Visits, path: &Path) ->
         .build()
         .context("cannot start the event loop")?;
     let stop = output::stop_on_ctrl_c();
-    runtime.block_on(capture_with(&bench, k, visits, path, &stop))?;
+    runtime.block_on(capture_with(&bench, k, visits, path, shown, &stop))?;
     let pairs = read_pairs(path)?;
     Ok(Captured {
         visits: pairs.len(),
