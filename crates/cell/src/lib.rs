@@ -33,6 +33,7 @@ pub mod calibrate;
 pub mod capture;
 pub mod config;
 pub mod device;
+pub mod forecast;
 pub mod journal;
 pub mod plan;
 pub mod program;

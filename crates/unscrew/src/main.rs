@@ -15,6 +15,7 @@ mod model;
 mod output;
 mod report;
 mod run;
+mod simulate;
 mod stats;
 mod synth;
 mod train;
@@ -53,6 +54,8 @@ enum Command {
     Model(model::Command),
     /// Render faces of outdoor units with depth and exact truth.
     Synth(synth::Args),
+    /// What a cell would do with thousands of units: completion, time, people, cells for a year's volume.
+    Simulate(simulate::Args),
     /// Rates with bounds and times by resource, from a run's journal.
     Stats(stats::Args),
 }
@@ -80,6 +83,7 @@ fn main() -> ExitCode {
         Command::Train(args) => train::run(&args),
         Command::Model(command) => model::run(&command),
         Command::Synth(args) => synth::run(&args),
+        Command::Simulate(args) => simulate::run(&args),
         Command::Stats(args) => stats::run(&args),
     };
     match result {

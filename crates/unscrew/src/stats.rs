@@ -3,7 +3,11 @@
 use crate::Ended;
 use crate::audit::{Actions, audit};
 use anyhow::Result;
-use cell::{journal::Journal, statistics::Statistics};
+use cell::{
+    forecast::{Assumptions, Prediction, predictions},
+    journal::Journal,
+    statistics::Statistics,
+};
 use serde::Serialize;
 use std::path::PathBuf;
 
@@ -26,6 +30,8 @@ struct Printed {
     statistics: Statistics,
     #[serde(flatten)]
     actions: Option<Actions>,
+    /// What its screws' scores said of each unit in scope beforehand, under the assumptions of `unscrew simulate`, and what became of it.
+    predictions: Vec<Prediction>,
 }
 
 pub fn run(args: &Args) -> Result<Ended> {
@@ -37,11 +43,28 @@ pub fn run(args: &Args) -> Result<Ended> {
         .exists()
         .then(|| audit(&journal, &sim::read_actions(&world)?))
         .transpose()?;
+    let predictions = predictions(&Assumptions::default(), &records);
     if args.json {
-        println!("{}", serde_json::to_string_pretty(&Printed { statistics, actions })?);
+        let printed = Printed {
+            statistics,
+            actions,
+            predictions,
+        };
+        println!("{}", serde_json::to_string_pretty(&printed)?);
         return Ok(Ended::Good);
     }
     print!("{}", text(&statistics));
+    if !predictions.is_empty() {
+        let n = predictions.len() as f64;
+        let square = |p: &Prediction| (p.predicted - f64::from(u8::from(p.finished))).powi(2);
+        println!(
+            "predicted  {:.1} % finished unaided, by the scores of their screws; {} of {} were (Brier score {:.2})",
+            100.0 * predictions.iter().map(|p| p.predicted).sum::<f64>() / n,
+            predictions.iter().filter(|p| p.finished).count(),
+            predictions.len(),
+            predictions.iter().map(square).sum::<f64>() / n
+        );
+    }
     if let Some(a) = actions {
         println!(
             "actions    {} by the world's own log; {} repeated, {} lost",

@@ -2,7 +2,7 @@
 //!
 //! The first two steps of the way of one unit: `RgbdFrame` → [`Detector::detect`] → [`Screw`] (pixel ± σ, and `Point<Camera>` where
 //! there is depth); a calibration map takes it from there. It is Algorithm 1 of the paper: a high-recall network over the whole
-//! picture ([`coarse_map`], [`candidates`]), the mean of three high-precision ones on gamma-corrected clips ([`look`]), the centre from
+//! picture ([`coarse_map`], [`candidates`]), a high-precision one, or the mean of several, on gamma-corrected clips ([`look`]), the centre from
 //! outer circle, cross edges and the networks' votes ([`outer_circle`], [`cross`], [`fuse`]), and the depth of the recess rim
 //! ([`locate`]).
 //!
