@@ -34,7 +34,7 @@ fn runner_with(fake: &Fake, folder: &Path, program: Program, finder: impl cell::
 struct Altered<F>(Fake, F);
 
 impl<F: Fn(&Fake, f64, &mut Vec<vision::Screw>) + Send + Sync> cell::run::Finder for Altered<F> {
-    fn find(&self, frame: &geometry::RgbdFrame, odds: f64) -> Result<Vec<vision::Screw>, cell::DeviceError> {
+    fn find(&self, frame: &geometry::RgbdFrame, odds: f64) -> Result<Vec<vision::Screw>, cell::device::DeviceError> {
         let mut found = self.0.find(frame, odds)?;
         (self.1)(&self.0, odds, &mut found);
         Ok(found)

@@ -278,6 +278,28 @@ fn a_unit_from_end_to_end() {
     let mut count = |name: &str| counted.remove(name).and_then(|n| n.as_u64());
     assert!(count("actions_total") >= removed["hits"].as_u64());
     assert_eq!((count("actions_repeated"), count("actions_lost")), (Some(0), Some(0)));
+    let predictions = stats.as_object_mut().and_then(|s| s.remove("predictions"));
+    let predicted = predictions.as_ref().and_then(|p| p[0]["predicted"].as_f64());
+    assert!(predicted.is_some_and(|p| (0.0..1.0).contains(&p)), "{predictions:?}");
     assert_eq!(stats, summary["statistics"]);
+    let told = unscrew(
+        at,
+        &[
+            "simulate",
+            "--from",
+            "out",
+            "--units",
+            "50",
+            "--repetitions",
+            "20",
+            "--json",
+        ],
+    );
+    let told: Value = serde_json::from_slice(&told.stdout).expect("JSON");
+    assert_eq!(
+        told["assumptions"]["screw"]["out_at_once"]["of"],
+        summary["statistics"]["screws_attempted"]
+    );
+    assert!(told["forecast"]["cycle_mean_s"]["mean"].as_f64() > Some(60.0), "{told}");
     refused(at, &["run", "--units", "1", "--out", "out"], &["out", "--resume"]);
 }
