@@ -500,6 +500,9 @@ struct Sums {
     causes: BTreeMap<&'static str, usize>,
 }
 
+/// What would be perfect, and how.
+type Perfect = (&'static str, fn(&mut Drawn));
+
 /// Lets `repetitions` times `units` units come to the cell.
 ///
 /// # Errors
@@ -541,16 +544,16 @@ pub fn forecast(a: &Assumptions, units: usize, repetitions: usize, seed: u64) ->
     }
     let ok = |sums: &[Sums]| sums.iter().map(|s| s.ok as f64).sum::<f64>() / (n * repetitions as f64);
     let now = ok(&sums);
-    let perfect: [(&str, &dyn Fn(&mut Drawn)); 5] = [
-        ("nothing out of scope", &|d| d.excluded = 0.0),
-        ("every screw found at the first look", &|d| d.found = 1.0),
-        ("every screw out at the first burst", &|d| d.out_at_once = 1.0),
-        ("every screw out after the ladder", &|d| d.out_after_ladder = 1.0),
-        ("no cover jams", &|d| d.cover_jams = 0.0),
+    let perfect: [Perfect; 5] = [
+        ("nothing out of scope", |d| d.excluded = 0.0),
+        ("every screw found at the first look", |d| d.found = 1.0),
+        ("every screw out at the first burst", |d| d.out_at_once = 1.0),
+        ("every screw out after the ladder", |d| d.out_after_ladder = 1.0),
+        ("no cover jams", |d| d.cover_jams = 0.0),
     ];
     let mut gains: Vec<(String, f64)> = perfect
         .into_iter()
-        .map(|(name, change)| (name.to_owned(), ok(&run(change)) - now))
+        .map(|(name, change)| (name.to_owned(), ok(&run(&change)) - now))
         .collect();
     gains.sort_by(|x, y| y.1.total_cmp(&x.1));
     let seconds = 3600.0 * a.plant.hours_a_year * a.plant.availability;
@@ -745,8 +748,10 @@ mod tests {
     #[test]
     fn help_helps_and_costs_a_persons_time() -> Result<(), ForecastError> {
         let with = |click, mill, hand| {
-            let mut a = Assumptions::default();
-            a.policy = Policy { click, mill, hand };
+            let a = Assumptions {
+                policy: Policy { click, mill, hand },
+                ..Assumptions::default()
+            };
             forecast(&a, 2000, 10, 1)
         };
         let (none, click, mill, all) = (
