@@ -120,6 +120,7 @@ pub async fn capture_pairs(
     };
     let known: HashSet<u64> = pairs.iter().map(|p| p.id).collect();
     let mover = Mover {
+        io: &devices.io,
         arm: carrier,
         approach: Approach::default(),
         timeouts: settings.timeouts,

@@ -1,6 +1,8 @@
 //! The cell file: which devices, which limits. TOML, unknown keys refused.
 
-use crate::device::DriveProgram;
+use crate::device::{Bit, DriveProgram};
+use crate::ladder::{Ladder, Rung};
+use crate::policy::Destructive;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 
@@ -68,6 +70,15 @@ pub struct CellConfig {
     /// How screws are driven.
     #[serde(default)]
     pub drive: Drive,
+    /// What is tried when a screw does not come out at once.
+    #[serde(default)]
+    pub ladder: Ladder,
+    /// What a person may be asked.
+    #[serde(default)]
+    pub help: Help,
+    /// When a head may be milled off.
+    #[serde(default)]
+    pub destructive: Destructive,
     /// How long anything may take.
     #[serde(default)]
     pub timeouts: Timeouts,
@@ -176,44 +187,46 @@ impl Default for Approach {
     }
 }
 
-/// Bounded programmes of the driver.
+/// The bounded programme that every screw is begun with; what follows is the [`Ladder`]'s.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Drive {
     /// First attempt.
     pub first: DriveProgram,
-    /// Once more after the bit slipped out: pressed harder.
-    pub after_cam_out: DriveProgram,
-    /// Once more after the screw did not turn: a longer burst.
-    pub after_seized: DriveProgram,
-    /// Places around a screw that the camera sees and the bit does not meet; 0: none.
-    pub search_steps: u32,
-    /// How far from it they are, mm: the bit's cone reaches 0.75 mm.
-    pub search_mm: f64,
 }
 
 impl Default for Drive {
     fn default() -> Self {
-        let first = DriveProgram {
-            axial_force_n: 150.0,
-            max_time_s: 2.5,
-            max_torque_nm: 12.0,
-            stroke_mm: 10.0,
-        };
         Self {
-            first,
-            after_cam_out: DriveProgram {
-                axial_force_n: 250.0,
-                ..first
+            first: DriveProgram {
+                axial_force_n: 150.0,
+                max_time_s: 2.5,
+                max_torque_nm: 12.0,
+                stroke_mm: 10.0,
+                bit: Bit::Cross,
             },
-            after_seized: DriveProgram {
-                max_time_s: 6.0,
-                max_torque_nm: 18.0,
-                axial_force_n: 200.0,
-                ..first
-            },
-            search_steps: 6,
-            search_mm: 0.8,
+        }
+    }
+}
+
+/// What a person may be asked.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Help {
+    /// Whether a person may be asked to click on screws in a picture.
+    pub click: bool,
+    /// Whether a person can be called to take out by hand what the cell may not mill: such a unit leaves with a note.
+    pub hand: bool,
+    /// How long an answer is waited for, s.
+    pub timeout_s: f64,
+}
+
+impl Default for Help {
+    fn default() -> Self {
+        Self {
+            click: false,
+            hand: false,
+            timeout_s: 120.0,
         }
     }
 }
@@ -274,6 +287,9 @@ impl CellConfig {
             exclusion: Exclusion::default(),
             approach: Approach::default(),
             drive: Drive::default(),
+            ladder: Ladder::default(),
+            help: Help::default(),
+            destructive: Destructive::default(),
             timeouts: Timeouts::default(),
             journal: JournalConfig::default(),
         }
@@ -319,25 +335,46 @@ impl CellConfig {
                 })
             }
         };
-        let drive = &self.drive;
-        for program in [drive.first, drive.after_cam_out, drive.after_seized] {
-            within("drive.*.max_time_s", program.max_time_s, 0.1, 15.0, "0.1 to 15 s")?;
+        for program in std::iter::once(self.drive.first).chain(self.ladder.rungs().filter_map(Rung::program)) {
             within(
-                "drive.*.max_torque_nm",
-                program.max_torque_nm,
-                0.5,
-                40.0,
-                "0.5 to 40 N m",
+                "max_time_s of a programme",
+                program.max_time_s,
+                0.1,
+                20.0,
+                "0.1 to 20 s",
             )?;
-            within(
-                "drive.*.axial_force_n",
-                program.axial_force_n,
-                10.0,
-                500.0,
-                "10 to 500 N",
-            )?;
-            within("drive.*.stroke_mm", program.stroke_mm, 1.0, 60.0, "1 to 60 mm")?;
+            let torque = program.max_torque_nm;
+            within("max_torque_nm of a programme", torque, 0.5, 40.0, "0.5 to 40 N m")?;
+            let force = program.axial_force_n;
+            within("axial_force_n of a programme", force, 10.0, 500.0, "10 to 500 N")?;
+            let deepest = if program.bit == Bit::Mill { 8.0 } else { 60.0 };
+            let limit = "1 to 60 mm, of a mill at most 8";
+            within("stroke_mm of a programme", program.stroke_mm, 1.0, deepest, limit)?;
         }
+        if self.drive.first.bit == Bit::Mill {
+            return within(
+                "drive.first.bit = mill",
+                f64::NAN,
+                0.0,
+                0.0,
+                "nothing is begun by destroying it",
+            );
+        }
+        for rung in self.ladder.rungs() {
+            if let Rung::Search { places, radius_mm } = *rung {
+                within("places of a search", f64::from(places), 1.0, 24.0, "1 to 24")?;
+                within("radius_mm of a search", radius_mm, 0.1, 3.0, "0.1 to 3 mm")?;
+            }
+        }
+        within("ladder.bursts_max", self.ladder.bursts_max as f64, 1.0, 40.0, "1 to 40")?;
+        within("help.timeout_s", self.help.timeout_s, 1.0, 3600.0, "1 s to an hour")?;
+        within(
+            "destructive.part_value",
+            self.destructive.part_value,
+            0.0,
+            1e6,
+            "0 to 1,000,000",
+        )?;
         let approach = &self.approach;
         within("approach.standoff_mm", approach.standoff_mm, 10.0, 60.0, "10 to 60 mm")?;
         within(

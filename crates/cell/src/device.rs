@@ -183,6 +183,30 @@ pub trait RobotArm: Send + Sync {
     async fn reset(&self) -> Result<(), DeviceError>;
 }
 
+/// What the driver's spindle carries. All end at the same length from the flange: a map holds for each of them.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Bit {
+    /// The cross bit.
+    #[default]
+    Cross,
+    /// A bit that cuts its own grip into a worn or filled recess.
+    Extractor,
+    /// A cutter that takes the head off: destructive.
+    Mill,
+}
+
+impl Bit {
+    /// Name, as in the tag [`tags::bit`] and in the job that mounts it.
+    pub fn name(self) -> &'static str {
+        match self {
+            Bit::Cross => "cross",
+            Bit::Extractor => "extractor",
+            Bit::Mill => "mill",
+        }
+    }
+}
+
 /// A bounded programme of the driver.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -193,8 +217,11 @@ pub struct DriveProgram {
     pub max_time_s: f64,
     /// Torque that is never exceeded, N m.
     pub max_torque_nm: f64,
-    /// Stroke after which the screw counts as out, mm.
+    /// Stroke after which the screw counts as out, mm; of a mill: how deep it goes.
     pub stroke_mm: f64,
+    /// With which bit; it is mounted first if the driver carries another.
+    #[serde(default)]
+    pub bit: Bit,
 }
 
 /// How a drive programme ended.
@@ -274,6 +301,12 @@ pub mod tags {
     pub const GRIPPER_HOLDING: &str = "gripper/holding";
     /// Bool, input: safety chain closed (observed only).
     pub const SAFETY_OK: &str = "safety/ok";
+    /// Bool, input: the plant's controller permits milling now; without it nothing is milled.
+    pub const MILL_PERMITTED: &str = "safety/mill_permitted";
+    /// Text, input: the bit that this arm's driver carries ([`Bit::name`](super::Bit::name)).
+    pub fn bit(arm: &str) -> String {
+        format!("{arm}/bit")
+    }
 }
 
 /// What the model-number reader read.
@@ -314,6 +347,37 @@ pub mod jobs {
     }
     /// Lays the held cover aside; the gripper is empty afterwards.
     pub const DROP: &str = "DROP";
+    /// Changes the driver's bit at the magazine; the tag [`bit`](super::tags::bit) says afterwards which it carries. `MOUNT_CROSS`,
+    /// `MOUNT_EXTRACTOR`, `MOUNT_MILL`.
+    pub fn mount(bit: super::Bit) -> String {
+        format!("MOUNT_{}", bit.name().to_uppercase())
+    }
+}
+
+/// A picture that a person is asked about.
+#[derive(Clone, Debug)]
+pub struct Question {
+    /// What is asked, in words.
+    pub text: String,
+    /// The picture.
+    pub image: RgbImage,
+    /// Which part of the whole picture it shows.
+    pub region: Region,
+    /// Heads that are in doubt, px of the whole picture.
+    pub doubtful: Vec<[f64; 2]>,
+}
+
+/// A person at a screen.
+#[async_trait]
+pub trait Operator: Send + Sync {
+    /// Shows the picture and asks for a click on every cross screw that still stands.
+    ///
+    /// # Returns
+    /// The middles of the recesses, px of the whole picture; none if the person sees none.
+    ///
+    /// # Errors
+    /// [`DeviceError::Timeout`] if nobody answers in time.
+    async fn point_at_screws(&self, question: &Question, timeout_s: f64) -> Result<Vec<[f64; 2]>, DeviceError>;
 }
 
 /// A robot arm with its place in the cell.
@@ -340,6 +404,8 @@ pub struct Devices {
     pub reader: Arc<dyn ModelReader>,
     /// Plant link.
     pub plant: Arc<dyn PlantLink>,
+    /// A person who may be asked, if there is one.
+    pub operator: Option<Arc<dyn Operator>>,
     /// Clock.
     pub clock: Arc<dyn Clock>,
 }

@@ -98,9 +98,13 @@ impl SafeTarget {
     pub fn contact_pose(&self) -> Transform<Base, Tool> {
         tool_pose(self.tip, self.approach)
     }
-    /// Pose of the tool in front of the screw, on the straight way to it.
+    /// Where the bit waits in front of the screw, on the straight way to it.
+    pub fn standoff(&self) -> Point<Base> {
+        self.tip.moved(self.approach, -self.standoff_mm)
+    }
+    /// Pose of the tool there.
     pub fn standoff_pose(&self) -> Transform<Base, Tool> {
-        tool_pose(self.tip.moved(self.approach, -self.standoff_mm), self.approach)
+        tool_pose(self.standoff(), self.approach)
     }
 }
 

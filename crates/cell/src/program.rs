@@ -66,6 +66,45 @@ pub struct Program {
     pub survey: Vec<FaceId>,
     /// The steps.
     pub steps: Vec<Step>,
+    /// What lies behind its faces: of a face that is not named nothing is known.
+    #[serde(default)]
+    pub regions: Vec<Region>,
+}
+
+/// What lies behind the sheet of a face.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Region {
+    /// The face.
+    pub face: FaceId,
+    /// Free depth behind the sheet at every screw, by the product's drawing, mm; left out: not known.
+    #[serde(default)]
+    pub clear_mm: Option<f64>,
+    /// Something that must never be cut, if it lies there.
+    #[serde(default)]
+    pub forbidden: Option<Forbidden>,
+}
+
+/// Something that must never be cut.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Forbidden {
+    /// Pipes and valves under pressure.
+    Refrigerant,
+    /// Capacitors that may be charged.
+    Capacitor,
+    /// Cables.
+    Wiring,
+}
+
+impl fmt::Display for Forbidden {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Refrigerant => "refrigerant pipes lie",
+            Self::Capacitor => "capacitors lie",
+            Self::Wiring => "cables lie",
+        })
+    }
 }
 
 /// One step: a face, and the work on it.
@@ -138,6 +177,11 @@ impl Program {
     /// None for the shipped text; the type is that of [`Program::parse`].
     pub fn paper() -> Result<Self, ProgramError> {
         Self::parse(PAPER_PROGRAM, "the built-in program")
+    }
+
+    /// What is known of what lies behind a face.
+    pub fn region(&self, face: &FaceId) -> Option<&Region> {
+        self.regions.iter().find(|region| region.face == *face)
     }
 
     /// Reads a program file.

@@ -3,7 +3,8 @@
 //! The record is a fold over the events ([`UnitRecord::apply`]) and nothing else, so that what the journal holds after a crash
 //! is what the program knows.
 
-use crate::device::{DriveEnd, DriveProgram};
+use crate::device::{Bit, DriveEnd, DriveProgram};
+use crate::policy::Decision;
 use crate::program::FaceId;
 use geometry::{Base, Camera, Point};
 use serde::{Deserialize, Serialize};
@@ -124,6 +125,9 @@ pub struct ScrewAttempt {
     pub bursts: Vec<Burst>,
     /// What a second picture said: `Some(true)` if a screw still stands there.
     pub still_there: Option<bool>,
+    /// What was chosen when nothing harmless was left, and why.
+    #[serde(default)]
+    pub decision: Option<Decision>,
 }
 
 impl ScrewAttempt {
@@ -146,6 +150,15 @@ impl ScrewAttempt {
             _ => false,
         }
     }
+    /// True if a second picture showed no screw where the bit had met nothing: there was none.
+    pub fn absent(&self) -> bool {
+        self.end() == Some(DriveEnd::MissedHead) && self.still_there == Some(false) && !self.removed()
+    }
+    /// True if its head was milled.
+    pub fn milled(&self) -> bool {
+        let mill = |b: &Burst| b.program.is_some_and(|p| p.bit == Bit::Mill) && b.end == Some(DriveEnd::Removed);
+        self.bursts.iter().any(mill)
+    }
     /// Time spent on it, s.
     pub fn time_s(&self) -> f64 {
         self.bursts.iter().map(|b| b.time_s).sum()
@@ -162,6 +175,8 @@ pub enum Purpose {
     Work,
     /// To find what was missed, after a cover did not come off.
     Missed,
+    /// To take out what a person has clicked on.
+    Clicked,
 }
 
 /// One look at a face and what followed.
@@ -312,6 +327,30 @@ impl fmt::Display for Outcome {
     }
 }
 
+/// What a person did for a unit.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Assist {
+    /// Nothing.
+    #[default]
+    None,
+    /// Clicked in a picture.
+    Remote,
+    /// Took it off the table or laid hands on it.
+    Hand,
+}
+
+/// What a unit's outcome has cost it.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Method {
+    /// Only screws are gone.
+    #[default]
+    NonDestructive,
+    /// A head was milled off.
+    Destructive,
+}
+
 /// What the time of a unit is spent on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -439,6 +478,22 @@ pub enum Event {
         /// The pictures.
         pictures: Vec<PictureId>,
     },
+    /// A person was asked to click on screws in a picture.
+    Asked {
+        /// What.
+        question: String,
+        /// The picture.
+        picture: PictureId,
+        /// The clicks, px of the whole picture; `None` if nobody answered.
+        clicks: Option<Vec<[f64; 2]>>,
+    },
+    /// Nothing harmless was left for a screw: what was chosen.
+    Chosen {
+        /// Number in [`FaceRecord::found`].
+        found: usize,
+        /// What, why, and where a cutter would go.
+        decision: Decision,
+    },
     /// A pull ended.
     Pulled {
         /// How.
@@ -461,6 +516,11 @@ pub enum Event {
         /// It.
         outcome: Outcome,
     },
+    /// The cell's state has changed in the middle of the unit.
+    State {
+        /// To this.
+        state: crate::packml::State,
+    },
     /// The unit has left the table.
     Discharged,
 }
@@ -477,11 +537,14 @@ impl Event {
             Self::Seen { .. } => "seen",
             Self::Driven { .. } => "driven",
             Self::Verified { .. } => "verified",
+            Self::Asked { .. } => "asked",
+            Self::Chosen { .. } => "chosen",
             Self::Pulled { .. } => "pulled",
             Self::LaidAside => "laid_aside",
             Self::Recovery { .. } => "recovery",
             Self::StepDone { .. } => "step_done",
             Self::Decided { .. } => "decided",
+            Self::State { .. } => "state",
             Self::Discharged => "discharged",
         }
     }
@@ -489,9 +552,9 @@ impl Event {
     /// What the time since the event before was spent on.
     fn resource(&self) -> Resource {
         match self {
-            Self::Arrived | Self::Resumed => Resource::Waiting,
+            Self::Arrived | Self::Resumed | Self::Asked { .. } | Self::State { .. } => Resource::Waiting,
             Self::Identified { .. } | Self::Presented { .. } | Self::Discharged => Resource::Handling,
-            Self::Driven { .. } => Resource::Screws,
+            Self::Driven { .. } | Self::Chosen { .. } => Resource::Screws,
             Self::Pulled { .. } | Self::LaidAside => Resource::Covers,
             Self::Intent {
                 act: Act::Present { .. } | Act::Discharge,
@@ -518,6 +581,12 @@ pub struct UnitRecord {
     /// What became of it; `None` while it is under way.
     #[serde(flatten)]
     pub outcome: Option<Outcome>,
+    /// What a person did for it.
+    #[serde(default)]
+    pub assist: Assist,
+    /// What it cost.
+    #[serde(default)]
+    pub method: Method,
     /// Steps that are finished.
     pub steps_done: usize,
     /// Every look at a face, in order.
@@ -549,6 +618,8 @@ impl UnitRecord {
             started_s: t_s,
             last_s: t_s,
             outcome: None,
+            assist: Assist::None,
+            method: Method::NonDestructive,
             steps_done: 0,
             faces: Vec::new(),
             covers: Vec::new(),
@@ -582,7 +653,7 @@ impl UnitRecord {
         self.times.add(resource, spent_s);
         self.last_s = t_s;
         match event {
-            Event::Arrived | Event::LaidAside => {}
+            Event::Arrived | Event::LaidAside | Event::State { .. } => {}
             Event::Identified { model } => self.model.clone_from(model),
             Event::Resumed => {
                 self.resumed += 1;
@@ -595,8 +666,24 @@ impl UnitRecord {
                 self.faces.push((**face).clone());
                 self.open = None;
             }
+            Event::Asked { clicks, picture, .. } => {
+                self.looks.push(picture.clone());
+                if clicks.as_ref().is_some_and(|c| !c.is_empty()) {
+                    self.assist = self.assist.max(Assist::Remote);
+                }
+            }
+            Event::Chosen { found, decision } => {
+                let attempts = self.faces.last_mut().map(|f| &mut f.attempts);
+                for attempt in attempts.into_iter().flatten().filter(|a| a.found == *found) {
+                    attempt.decision = Some(decision.clone());
+                }
+            }
             Event::Driven { found, arm, burst } => {
                 self.open = None;
+                // a cut that was begun has left its mark, whatever came of it
+                if burst.program.is_some_and(|p| p.bit == Bit::Mill) {
+                    self.method = Method::Destructive;
+                }
                 if let Some(face) = self.faces.last_mut() {
                     match face.attempts.iter_mut().find(|a| a.found == *found) {
                         Some(attempt) => {
@@ -608,6 +695,7 @@ impl UnitRecord {
                             arm: arm.clone(),
                             bursts: vec![burst.clone()],
                             still_there: None,
+                            decision: None,
                         }),
                     }
                 }
@@ -628,7 +716,18 @@ impl UnitRecord {
             }
             Event::Recovery { on } => self.recovering = *on,
             Event::StepDone { step } => self.steps_done = step + 1,
-            Event::Decided { outcome } => self.outcome = Some(outcome.clone()),
+            Event::Decided { outcome } => {
+                if matches!(
+                    outcome,
+                    Outcome::Ng {
+                        reason: NgReason::TakenAway,
+                        ..
+                    }
+                ) {
+                    self.assist = Assist::Hand;
+                }
+                self.outcome = Some(outcome.clone());
+            }
             Event::Discharged => {
                 self.open = None;
                 self.discharged = true;

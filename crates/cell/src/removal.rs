@@ -1,8 +1,9 @@
 //! One screw: approach, drive, retreat; and the moves of the arms, none of which is ever sent twice.
 
-use crate::config::{Approach, Drive, Timeouts};
+use crate::config::{Approach, Timeouts};
 use crate::device::{
-    Arm, ArmState, Clock, DeviceError, DriveEnd, DriveProgram, DriverTool, Motion, RobotArm, Ticket, jobs,
+    Arm, ArmState, Bit, CellIo, Clock, DeviceError, DriveEnd, DriveProgram, DriverTool, Motion, RobotArm, TagValue,
+    Ticket, jobs, tags,
 };
 use crate::plan::{SafeTarget, tool_pose};
 use crate::record::Burst;
@@ -15,28 +16,6 @@ const ARRIVED_RAD: f64 = 0.005;
 /// Time between two looks at the state of an arm that is under way, s.
 const POLL_S: f64 = 0.05;
 
-/// What a failed or doubtful burst allows to be tried next; once a screw, and only where the cause can be met.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Retry {
-    /// Look again with a region of the picture, map again, and drive with this programme if the screw still stands.
-    LookAgain(DriveProgram),
-    /// Drive again at the same place with this programme.
-    Harder(DriveProgram),
-}
-
-/// The ladder: what may be tried after a burst that ended like this.
-pub fn retry_after(end: Option<DriveEnd>, drive: &Drive) -> Option<Retry> {
-    match end {
-        Some(DriveEnd::Removed) => None,
-        Some(DriveEnd::MissedHead) => Some(Retry::LookAgain(drive.first)),
-        Some(DriveEnd::CamOut) => Some(Retry::Harder(drive.after_cam_out)),
-        Some(DriveEnd::Seized) => Some(Retry::Harder(drive.after_seized)),
-        // the screw may be out, half out or untouched: only a picture tells
-        Some(DriveEnd::TimeOut) => Some(Retry::LookAgain(drive.after_seized)),
-        None => Some(Retry::LookAgain(drive.first)),
-    }
-}
-
 /// An arm with the limits of its moves.
 pub struct Mover<'a> {
     /// The arm.
@@ -47,6 +26,8 @@ pub struct Mover<'a> {
     pub timeouts: Timeouts,
     /// The cell's clock.
     pub clock: &'a Arc<dyn Clock>,
+    /// The cell's I/O: which bit a driver carries.
+    pub io: &'a Arc<dyn CellIo>,
 }
 
 impl std::fmt::Debug for Mover<'_> {
@@ -116,12 +97,30 @@ impl Mover<'_> {
             });
         };
         self.ready().await?;
+        self.mount(program.bit).await?;
         self.to_standoff(target, Motion::Joint).await?;
         let worked = self.work(driver, target, program, burst).await;
         let back = Motion::Linear {
             speed_mm_s: self.approach.retract_mm_s,
         };
         worked.and(self.to_standoff(target, back).await)
+    }
+
+    /// Sees to it that the driver carries a bit. Whether it does is read, before and after.
+    async fn mount(&self, bit: Bit) -> Result<(), DeviceError> {
+        let tag = tags::bit(self.robot().name());
+        let wanted = TagValue::Text(bit.name().into());
+        if self.io.read(&tag).await? == wanted {
+            return Ok(());
+        }
+        self.job(&jobs::mount(bit)).await?;
+        match self.io.read(&tag).await? {
+            now if now == wanted => Ok(()),
+            now => Err(DeviceError::NotReady {
+                device: self.robot().name().into(),
+                state: format!("the driver carries {now:?}, not the {} bit", bit.name()),
+            }),
+        }
     }
 
     /// From in front of the screw: in, and drive.

@@ -3,21 +3,28 @@
 //! Every act is in the journal before it is begun, every answer before the next act. The state of a unit is the fold of its events
 //! ([`UnitRecord`]), so that going on after a crash and going on after a step are the same thing.
 
+mod climb;
+
 use crate::capture::{FaceFit, Shot, present, region_around, regions_around, sheet_depth_mm, shoot};
 use crate::config::CellConfig;
 use crate::device::{DeviceError, Devices, DriveEnd, DriveProgram, TagValue, jobs, tags};
 use crate::journal::{Journal, JournalError};
+use crate::ladder::Cause;
+use crate::packml::{Command, Illegal, Machine, State};
 use crate::plan::{self, Reach, SafeTarget, Target};
 use crate::program::{FaceId, Program, Step, Work};
 use crate::record::{
     Act, CoverRecord, Event, ExclusionReason, FacePlane, FaceRecord, LeftAlone, NgReason, Outcome, PictureId, PullEnd,
     Purpose, ScrewAttempt, SeenBy, UnitRecord, Verdict,
 };
-use crate::removal::{Mover, Retry, retry_after};
+use crate::removal::Mover;
 use calibration::Map;
 use geometry::{Pixel, RgbdFrame};
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
 
+/// How often a held cell looks whether it may go on, s.
+const HELD_POLL_S: f64 = 0.1;
 /// A cover is off if the sheet around its screws lies this much deeper than before, mm.
 const COVER_OFF_MM: f64 = 15.0;
 
@@ -93,6 +100,16 @@ pub enum RunError {
         /// What the device said.
         source: DeviceError,
     },
+    /// The cell does not execute: it was not started, or was stopped, held or aborted in the middle of a unit. The unit stays as it is.
+    #[error(
+        "the cell is in state {state}{why}; nothing moves until it is reset and started again (then go on with --resume)"
+    )]
+    NotExecuting {
+        /// Its state.
+        state: State,
+        /// What led there, if anything did.
+        why: String,
+    },
     /// The journal cannot be written: nothing is done that is not written down.
     #[error(transparent)]
     Journal(#[from] JournalError),
@@ -103,6 +120,8 @@ enum Stop {
     Decided(Outcome),
     Device(DeviceError),
     Journal(JournalError),
+    /// The cell no longer executes: the unit stays where it is.
+    Halted(String),
 }
 impl From<DeviceError> for Stop {
     fn from(error: DeviceError) -> Self {
@@ -115,6 +134,14 @@ impl From<JournalError> for Stop {
     }
 }
 
+/// True if a person's eyes on the picture may take away the reason.
+fn is_for_eyes(reason: ExclusionReason) -> bool {
+    matches!(
+        reason,
+        ExclusionReason::SlotNotWorkable | ExclusionReason::ScrewsNotFound
+    )
+}
+
 /// Takes units apart.
 pub struct Runner {
     devices: Devices,
@@ -123,6 +150,7 @@ pub struct Runner {
     program: Program,
     config: CellConfig,
     journal: Journal,
+    machine: Arc<Mutex<Machine>>,
 }
 
 impl std::fmt::Debug for Runner {
@@ -176,7 +204,51 @@ impl Runner {
             program,
             config,
             journal,
+            machine: Arc::default(),
         })
+    }
+
+    /// Mode and state of the cell, for commands from elsewhere; they take effect before the next act.
+    pub fn machine(&self) -> Arc<Mutex<Machine>> {
+        self.machine.clone()
+    }
+
+    /// Resets and starts the cell: what a person asks for, never the program itself.
+    ///
+    /// # Errors
+    /// [`Illegal`] from another state than stopped, completed or idle.
+    pub fn start(&self) -> Result<(), Illegal> {
+        let mut machine = self.machine.lock().unwrap_or_else(PoisonError::into_inner);
+        if machine.state() != State::Idle {
+            machine.command(Command::Reset)?;
+            machine.done();
+        }
+        machine.command(Command::Start)?;
+        machine.done();
+        Ok(())
+    }
+
+    /// Asks for something that belongs to the course of work; what is not legal then (a person has stopped the cell) is not done.
+    fn proceed(&self, command: Command) -> State {
+        let mut machine = self.machine.lock().unwrap_or_else(PoisonError::into_inner);
+        if machine.command(command).is_ok() {
+            machine.done();
+        }
+        machine.state()
+    }
+
+    /// The units that were asked for are done.
+    pub fn complete(&self) -> State {
+        self.proceed(Command::Complete)
+    }
+
+    fn executing(&self) -> Result<(), RunError> {
+        let state = self.machine.lock().unwrap_or_else(PoisonError::into_inner).state();
+        if state == State::Execute {
+            return Ok(());
+        }
+        let why = String::new();
+        Err(RunError::NotExecuting { state, why })
     }
 
     /// The journal.
@@ -189,11 +261,14 @@ impl Runner {
     /// # Errors
     /// [`RunError`]; a unit that fails is not one.
     pub async fn run_unit(&mut self, observer: &dyn Observer) -> Result<UnitRecord, RunError> {
+        self.executing()?;
         let since_s = self.devices.clock.now_s();
+        self.proceed(Command::Suspend); // until a unit comes
         self.load().await.map_err(|source| RunError::Handling {
             action: "waiting for a unit",
             source,
         })?;
+        self.proceed(Command::Unsuspend);
         let loaded_s = self.devices.clock.now_s();
         let unit = self.journal.begin_unit(since_s)?;
         let mut way = Way {
@@ -221,6 +296,7 @@ impl Runner {
     /// # Errors
     /// [`RunError`].
     pub async fn resume_unit(&mut self, observer: &dyn Observer) -> Result<Option<UnitRecord>, RunError> {
+        self.executing()?;
         let Some(unit) = self.journal.unfinished()? else {
             return Ok(None);
         };
@@ -298,6 +374,7 @@ impl Way<'_> {
             approach: runner.config.approach,
             timeouts: runner.config.timeouts,
             clock: &runner.devices.clock,
+            io: &runner.devices.io,
         })
     }
 
@@ -312,6 +389,7 @@ impl Way<'_> {
                     detail: error.to_string(),
                 },
                 Err(Stop::Journal(error)) => return Err(error.into()),
+                Err(Stop::Halted(why)) => return Err(self.halted(why)),
             };
             self.observer.note(&outcome.to_string());
             if self.record.recovering {
@@ -323,6 +401,7 @@ impl Way<'_> {
             match self.discharge().await {
                 Ok(()) => self.log(Event::Discharged)?,
                 Err(Stop::Journal(error)) => return Err(error.into()),
+                Err(Stop::Halted(why)) => return Err(self.halted(why)),
                 Err(Stop::Device(source)) => {
                     return Err(RunError::Handling {
                         action: "handing the unit out; clear the table by hand, then go on with --resume",
@@ -333,6 +412,51 @@ impl Way<'_> {
             }
         }
         self.close().await
+    }
+
+    fn halted(&self, why: String) -> RunError {
+        let state = self
+            .runner
+            .machine
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .state();
+        RunError::NotExecuting {
+            state,
+            why: format!(": {why}"),
+        }
+    }
+
+    /// Writes down what is about to be done, unless the cell no longer executes: the one place that every act passes.
+    async fn begin(&mut self, act: Act) -> Result<(), Stop> {
+        self.gate().await?;
+        Ok(self.log(Event::Intent { act })?)
+    }
+
+    /// Waits out a hold; ends the work if the cell was stopped or the safety chain is open.
+    async fn gate(&mut self) -> Result<(), Stop> {
+        let machine = self.runner.machine.clone();
+        let locked = || machine.lock().unwrap_or_else(PoisonError::into_inner);
+        loop {
+            let closed = self.runner.devices.io.read(tags::SAFETY_OK).await? == TagValue::Bool(true);
+            if !closed {
+                locked().abort();
+            }
+            let before = locked().state();
+            let state = locked().done();
+            if state != before {
+                self.log(Event::State { state })?;
+            }
+            match state {
+                State::Execute => return Ok(()),
+                State::Held => {
+                    self.runner.devices.clock.pass(HELD_POLL_S);
+                    tokio::time::sleep(Duration::from_secs_f64(HELD_POLL_S)).await;
+                }
+                _ if !closed => return Err(Stop::Halted("the safety chain is open".into())),
+                _ => return Err(Stop::Halted("it was told to".into())),
+            }
+        }
     }
 
     async fn close(self) -> Result<UnitRecord, RunError> {
@@ -449,7 +573,8 @@ impl Way<'_> {
     }
 
     /// Sends the arms out of the way of table and camera.
-    async fn home(&self) -> Result<(), DeviceError> {
+    async fn home(&mut self) -> Result<(), Stop> {
+        self.gate().await?;
         for arm in 0..self.runner.devices.arms.len() {
             if let Some(mover) = self.mover(arm) {
                 mover.home().await?;
@@ -459,9 +584,7 @@ impl Way<'_> {
     }
 
     async fn turn(&mut self, face: &FaceId) -> Result<(), Stop> {
-        self.log(Event::Intent {
-            act: Act::Present { face: face.clone() },
-        })?;
+        self.begin(Act::Present { face: face.clone() }).await?;
         present(&self.runner.devices, face, self.runner.config.timeouts.present_s).await?;
         Ok(self.log(Event::Presented { face: face.clone() })?)
     }
@@ -481,6 +604,10 @@ impl Way<'_> {
         let odds = self.odds(purpose);
         let mut screws = self.runner.finder.find(&shot.frame, odds)?;
         self.budget(&shot);
+        if purpose == Purpose::Clicked {
+            let text = format!("Which heads on the {face} are cross screws that still stand?");
+            screws = self.ask(&shot, screws, &text).await?;
+        }
         let certain = screws
             .iter()
             .filter(|s| !plan::is_doubtful(s.fits, odds) || s.verdict == Verdict::Other);
@@ -529,7 +656,7 @@ impl Way<'_> {
         } else {
             0
         };
-        let excluded = if touched || purpose == Purpose::Missed {
+        let excluded = if touched || matches!(purpose, Purpose::Missed | Purpose::Clicked) {
             None
         } else {
             plan::exclusion(&seen, least, &config)
@@ -562,7 +689,7 @@ impl Way<'_> {
     fn odds(&self, purpose: Purpose) -> f64 {
         match purpose {
             Purpose::Missed => self.runner.config.inspection.stuck_cover_odds,
-            Purpose::Survey | Purpose::Work => 1.0,
+            Purpose::Survey | Purpose::Work | Purpose::Clicked => 1.0,
         }
     }
 
@@ -586,7 +713,12 @@ impl Way<'_> {
 
     /// Takes the screws of a face out; returns how many came out.
     async fn screws(&mut self, index: usize, step: &Step, face: &FaceId, purpose: Purpose) -> Result<usize, Stop> {
-        let (shot, targets) = self.look_at(index, step, face, purpose).await?;
+        let (shot, targets) = match self.look_at(index, step, face, purpose).await {
+            Err(Stop::Decided(Outcome::Excluded { reason, .. })) if self.may_ask() && is_for_eyes(reason) => {
+                self.look_at(index, step, face, Purpose::Clicked).await?
+            }
+            other => other?,
+        };
         let count = targets.len();
         for (number, target) in targets.iter().enumerate() {
             self.observer.screw(number, count);
@@ -595,58 +727,6 @@ impl Way<'_> {
         self.verify(&targets, &shot).await?;
         self.home().await?;
         Ok(self.record.faces.last().map_or(0, FaceRecord::removed))
-    }
-
-    /// One screw: a burst, and one more where the cause allows it.
-    async fn remove(&mut self, target: &Target, shot: &Shot) -> Result<(), Stop> {
-        let drive = self.runner.config.drive;
-        let end = self.burst(target.found, target.place, drive.first, None).await?;
-        let Some(retry) = retry_after(end, &drive) else {
-            return Ok(());
-        };
-        self.log(Event::Recovery { on: true })?;
-        self.retry(target, shot, retry).await?;
-        Ok(self.log(Event::Recovery { on: false })?)
-    }
-
-    async fn retry(&mut self, target: &Target, shot: &Shot, retry: Retry) -> Result<(), Stop> {
-        match retry {
-            Retry::Harder(program) => {
-                self.burst(target.found, target.place, program, None).await?;
-            }
-            Retry::LookAgain(program) => {
-                if let Some((place, picture)) = self.second_look(target, shot).await? {
-                    let end = self.burst(target.found, place, program, Some(picture)).await?;
-                    if !self.is_doubtful(target.found) {
-                        self.search(target.found, place, program, end).await?;
-                    }
-                }
-            }
-        }
-        Ok(())
-    }
-
-    /// Where the camera still sees a screw but the bit met none: once around the place, farther out than its cone reaches.
-    async fn search(
-        &mut self,
-        found: usize,
-        place: SafeTarget,
-        program: DriveProgram,
-        mut end: Option<DriveEnd>,
-    ) -> Result<(), Stop> {
-        let drive = self.runner.config.drive;
-        for step in 0..drive.search_steps {
-            if end != Some(DriveEnd::MissedHead) {
-                break;
-            }
-            let angle = std::f64::consts::TAU * f64::from(step) / f64::from(drive.search_steps);
-            let across_mm = [drive.search_mm * angle.cos(), drive.search_mm * angle.sin()];
-            let map = self.runner.maps.get(place.arm());
-            if let Some(beside) = map.and_then(|map| place.beside(map, across_mm)) {
-                end = self.burst(found, beside, program, None).await?;
-            }
-        }
-        Ok(())
     }
 
     async fn burst(
@@ -670,14 +750,14 @@ impl Way<'_> {
             .faces
             .last()
             .and_then(|f| f.attempts.iter().find(|a| a.found == found));
-        self.log(Event::Intent {
-            act: Act::Drive {
-                found,
-                arm: arm.clone(),
-                aim: place.tip(),
-                burst: done.map_or(0, |a| a.bursts.len()),
-            },
-        })?;
+        let burst = done.map_or(0, |a| a.bursts.len());
+        self.begin(Act::Drive {
+            found,
+            arm: arm.clone(),
+            aim: place.tip(),
+            burst,
+        })
+        .await?;
         let Some(mover) = self.mover(place.arm()) else {
             return Ok(None);
         };
@@ -699,7 +779,15 @@ impl Way<'_> {
     }
 
     /// Looks at one screw again and maps it anew. `None` if no screw is seen there any more, or no arm may go there.
-    async fn second_look(&mut self, target: &Target, shot: &Shot) -> Result<Option<(SafeTarget, PictureId)>, Stop> {
+    ///
+    /// # Arguments
+    /// * `asks` – whether a person is asked to click on it.
+    async fn second_look(
+        &mut self,
+        target: &Target,
+        shot: &Shot,
+        asks: bool,
+    ) -> Result<Option<(SafeTarget, PictureId)>, Stop> {
         self.home().await?;
         let config = self.runner.config.clone();
         let Some((center, half_px)) = self.place_in_picture(target.found, shot) else {
@@ -715,8 +803,13 @@ impl Way<'_> {
             config.inspection.depth_frames.max(1),
         )
         .await?;
-        let screws = self.runner.finder.find(&near.frame, self.face_odds())?;
+        let mut screws = self.runner.finder.find(&near.frame, self.face_odds())?;
         self.budget(&near);
+        if asks {
+            screws = self
+                .ask(&near, screws, "Where is the screw that the bit does not meet?")
+                .await?;
+        }
         let picture = self
             .runner
             .journal
@@ -767,13 +860,12 @@ impl Way<'_> {
                 .and_then(|f| f.attempts.iter().find(|a| a.found == found));
             let retried = tried.is_some_and(|a| a.retries() > 0);
             if let Some(target) = targets.iter().find(|t| t.found == found && !retried) {
-                self.log(Event::Recovery { on: true })?;
-                self.retry(target, shot, Retry::LookAgain(self.runner.config.drive.first))
-                    .await?;
+                self.climb(target, shot, Cause::StillThere).await?;
                 again = true;
             }
         }
         if again {
+            self.log(Event::Recovery { on: true })?;
             self.look_where(claimed, shot).await?;
             self.log(Event::Recovery { on: false })?;
         }
@@ -856,6 +948,17 @@ impl Way<'_> {
                 }
             }
         }
+        if self.may_ask() {
+            for face in held_by {
+                let looked_at = self.record.faces.iter().any(|f| f.face == *face);
+                if looked_at && self.screws(index, step, face, Purpose::Clicked).await? > 0 {
+                    pulled_again = true;
+                    if self.pull(index, step).await? == PullEnd::Off {
+                        return Ok(self.log(Event::Recovery { on: false })?);
+                    }
+                }
+            }
+        }
         // the grip may have slipped: a bounded pull may be tried a second time
         if !pulled_again && self.pull(index, step).await? == PullEnd::Off {
             return Ok(self.log(Event::Recovery { on: false })?);
@@ -926,9 +1029,7 @@ impl Way<'_> {
         self.lay_aside().await?;
         self.turn(&step.present).await?;
         let begin_s = self.now_s();
-        self.log(Event::Intent {
-            act: Act::Pull { cover: cover.clone() },
-        })?;
+        self.begin(Act::Pull { cover: cover.clone() }).await?;
         let arm = self.runner.devices.arms.iter().position(|arm| arm.robot.name() == by);
         if let Some(mover) = arm.and_then(|arm| self.mover(arm)) {
             mover.ready().await?;
@@ -985,7 +1086,7 @@ impl Way<'_> {
         if self.runner.devices.io.read(tags::LOADED).await? != loaded {
             return Ok(());
         }
-        self.log(Event::Intent { act: Act::Discharge })?;
+        self.begin(Act::Discharge).await?;
         let io = &self.runner.devices.io;
         io.write(tags::MAGNET, TagValue::Bool(false)).await?;
         match io.write(tags::DISCHARGE, TagValue::Bool(true)).await {

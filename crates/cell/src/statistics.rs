@@ -1,6 +1,6 @@
 //! Rates with their bounds, and times by resource: what a number of units says.
 
-use crate::record::{Outcome, Times, UnitRecord};
+use crate::record::{Assist, Method, Outcome, Times, UnitRecord};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
@@ -23,6 +23,10 @@ pub struct Statistics {
     pub ok_in_scope: Rate,
     /// OK of all (paper: 60.0 %).
     pub ok_of_all: Rate,
+    /// Of all: OK without a person and without a milled head.
+    pub ok_unaided: Rate,
+    /// Of all: OK without a milled head, with no more than a person's clicks in pictures.
+    pub ok_with_click: Rate,
     /// Mean cycle over OK and NG units, as the paper counts it, s (paper: 193, its parts 195.7).
     pub cycle_mean_s: Option<f64>,
     /// Mean cycle of OK units, s (paper: 197).
@@ -71,6 +75,12 @@ impl Statistics {
             };
             *causes.entry(cause).or_default() += 1;
         }
+        let whole: Vec<Assist> = ok
+            .iter()
+            .filter(|r| r.method == Method::NonDestructive)
+            .map(|r| r.assist)
+            .collect();
+        let with = |most: Assist| whole.iter().filter(|assist| **assist <= most).count();
         let in_scope: Vec<&UnitRecord> = ok.iter().chain(&ng).copied().collect();
         let units = in_scope.len() + excluded;
         let mut times_mean = Times::default();
@@ -91,6 +101,8 @@ impl Statistics {
             excluded_after_acting: after,
             ok_in_scope: Rate::of(ok.len(), in_scope.len()),
             ok_of_all: Rate::of(ok.len(), units),
+            ok_unaided: Rate::of(with(Assist::None), units),
+            ok_with_click: Rate::of(with(Assist::Remote), units),
             cycle_mean_s: mean_cycle_s(&in_scope),
             cycle_ok_mean_s: mean_cycle_s(&ok),
             cycle_ng_mean_s: mean_cycle_s(&ng),
@@ -137,9 +149,14 @@ mod tests {
             detail: String::new(),
             screws_out_before: 3,
         };
+        let milled = UnitRecord {
+            assist: Assist::Remote,
+            method: Method::Destructive,
+            ..unit(2, Some(Outcome::Ok), 180.0)
+        };
         let records = [
             unit(1, Some(Outcome::Ok), 200.0),
-            unit(2, Some(Outcome::Ok), 180.0),
+            milled,
             unit(3, Some(ng), 100.0),
             unit(4, Some(excluded), 20.0),
             unit(5, None, 0.0),
@@ -151,6 +168,7 @@ mod tests {
         );
         assert_eq!(s.ok_in_scope.rate, Some(2.0 / 3.0));
         assert_eq!(s.ok_of_all.rate, Some(0.5));
+        assert_eq!((s.ok_unaided.hits, s.ok_with_click.hits, s.ok_with_click.of), (1, 1, 4));
         assert_eq!((s.cycle_mean_s, s.cycle_ok_mean_s), (Some(160.0), Some(190.0)));
         assert!((s.times_mean.screws_s - 160.0).abs() < 1e-9);
         assert_eq!(s.causes["ng: screw_seized"], 1);

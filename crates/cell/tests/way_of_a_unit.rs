@@ -19,7 +19,7 @@ fn runner(fake: &Fake, folder: &Path) -> Runner {
 
 fn runner_with(fake: &Fake, folder: &Path, program: Program, finder: impl cell::run::Finder + 'static) -> Runner {
     let journal = Journal::open(folder).expect("journal");
-    Runner::new(
+    let runner = Runner::new(
         fake.devices(),
         Arc::new(finder),
         vec![map()],
@@ -27,7 +27,9 @@ fn runner_with(fake: &Fake, folder: &Path, program: Program, finder: impl cell::
         CellConfig::simulated(),
         journal,
     )
-    .expect("runner")
+    .expect("runner");
+    runner.start().expect("started");
+    runner
 }
 
 /// What the fake finds, with something done to it: the function is told the world and the odds.
@@ -311,7 +313,7 @@ fn the_ladder_meets_each_cause_once() {
 }
 
 #[test]
-fn a_seized_screw_is_left_after_one_retry_and_the_pull_decides() {
+fn a_seized_screw_is_left_when_its_ladder_ends_and_the_pull_decides() {
     let seized = [DriveEnd::Seized; 9];
     let fake = Fake::new(&[("top", vec![screw_that_ends(0.0, 0.0, &seized), screw(90.0, 0.0)])]);
     fake.world().faces.insert("front".into(), vec![screw(0.0, 0.0)]);
@@ -327,7 +329,11 @@ fn a_seized_screw_is_left_after_one_retry_and_the_pull_decides() {
         "{:?}",
         record.outcome
     );
-    assert_eq!(fake.world().faces["top"][0].bursts, 2);
+    assert_eq!(fake.world().faces["top"][0].bursts, 3);
+    let attempt = record.attempts().find(|a| a.decision.is_some()).expect("a decision");
+    let decision = attempt.decision.as_ref().expect("a decision");
+    assert_eq!(decision.choice, cell::policy::Choice::Reject);
+    assert!(decision.because.contains("cell file"), "{}", decision.because);
     assert_eq!(fake.entries(&["PULL"]), ["PULL_TOP"]);
 }
 

@@ -4,9 +4,9 @@ use crate::draw::mix;
 use crate::faults::Fault;
 use crate::kinematics::{Gp25, HOME_RAD};
 use crate::mechanics::{ArmErrors, Body};
-use crate::world::{CoverJob, Shared, World, lock};
+use crate::world::{ArmJob, Shared, World, lock};
 use async_trait::async_trait;
-use cell::device::{ArmMode, ArmState, DeviceError, Motion, RobotArm, Ticket, jobs};
+use cell::device::{ArmMode, ArmState, Bit, DeviceError, Motion, RobotArm, Ticket, jobs};
 use geometry::{Base, Camera, Flange, Tool, Transform};
 
 /// Round trip to the controller, s.
@@ -27,6 +27,8 @@ pub(crate) struct SimArm {
     pub(crate) base_from_camera: Transform<Base, Camera>,
     pub(crate) gripper: bool,
     pub(crate) jig: bool,
+    /// What the driver carries.
+    pub(crate) bit: Bit,
     joints_rad: [f64; 6],
     came_from: [f64; 6],
     visits: u64,
@@ -46,7 +48,7 @@ struct Moving {
     from_s: f64,
     until_s: f64,
     alarm_at_s: Option<f64>,
-    job: Option<CoverJob>,
+    job: Option<ArmJob>,
 }
 
 impl SimArm {
@@ -65,6 +67,7 @@ impl SimArm {
             base_from_camera,
             gripper,
             jig: false,
+            bit: Bit::Cross,
             joints_rad: HOME_RAD,
             came_from: [1.0; 6],
             visits: 0,
@@ -102,7 +105,7 @@ impl SimArm {
     }
 
     /// Ends a motion whose time is over; returns the job that it completed.
-    pub(crate) fn settle(&mut self, now_s: f64) -> Option<CoverJob> {
+    pub(crate) fn settle(&mut self, now_s: f64) -> Option<ArmJob> {
         let m = self.motion.clone()?;
         if let Some(at_s) = m.alarm_at_s {
             if at_s <= now_s {
@@ -162,7 +165,7 @@ impl SimArm {
         })
     }
 
-    fn begin(&mut self, now_s: f64, to_rad: [f64; 6], takes_s: f64, alarm: bool, job: Option<CoverJob>) -> Ticket {
+    fn begin(&mut self, now_s: f64, to_rad: [f64; 6], takes_s: f64, alarm: bool, job: Option<ArmJob>) -> Ticket {
         self.tickets += 1;
         self.motion = Some(Moving {
             ticket: self.tickets,
@@ -205,7 +208,7 @@ impl ArmHandle {
         world: &mut World,
         to_rad: [f64; 6],
         takes_s: f64,
-        job: Option<CoverJob>,
+        job: Option<ArmJob>,
         action: &str,
     ) -> Result<Ticket, DeviceError> {
         let alarm = world.faults.happens(Fault::ArmAlarm);
@@ -303,9 +306,14 @@ impl RobotArm for ArmHandle {
         let (takes_s, work) = if job == jobs::HOME {
             (home_s, None)
         } else if arm.gripper && job == jobs::DROP {
-            (DROP_S, Some(CoverJob::Drop))
-        } else if let Some(cover) = CoverJob::pulls().find(|c| jobs::pull(c.name()) == job && arm.gripper) {
-            (PULL_S, Some(CoverJob::Pull(cover)))
+            (DROP_S, Some(ArmJob::Drop))
+        } else if let Some(cover) = ArmJob::pulls().find(|c| jobs::pull(c.name()) == job && arm.gripper) {
+            (PULL_S, Some(ArmJob::Pull(cover)))
+        } else if let Some(bit) = [Bit::Cross, Bit::Extractor, Bit::Mill]
+            .into_iter()
+            .find(|bit| jobs::mount(*bit) == job)
+        {
+            (home_s + world.assumed().bit_change_s, Some(ArmJob::Mount(bit)))
         } else {
             return Err(DeviceError::Fault {
                 device: self.name.clone(),

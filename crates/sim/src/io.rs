@@ -35,10 +35,14 @@ fn value_of(world: &World, tag: &str) -> Result<TagValue, DeviceError> {
         }
         tags::GRIPPER_HOLDING => TagValue::Bool(world.held_cover.is_some()),
         tags::SAFETY_OK => TagValue::Bool(true),
+        tags::MILL_PERMITTED => TagValue::Bool(world.assumed().mill_permitted),
         // Outputs read back as pulses: the PLC takes the request and clears it.
         tags::FEED | tags::DISCHARGE => TagValue::Bool(false),
         tags::PRESENT => TagValue::Text(String::new()),
-        _ => return Err(unknown(tag)),
+        _ => match world.arms.iter().find(|arm| tags::bit(&arm.name) == tag) {
+            Some(arm) => TagValue::Text(arm.bit.name().into()),
+            None => return Err(unknown(tag)),
+        },
     })
 }
 
@@ -108,7 +112,7 @@ impl CellIo for IoHandle {
                 world.turn(face);
                 Ok(())
             }
-            (tags::LOADED | tags::PRESENTED | tags::GRIPPER_HOLDING | tags::SAFETY_OK, _) => {
+            (tags::LOADED | tags::PRESENTED | tags::GRIPPER_HOLDING | tags::SAFETY_OK | tags::MILL_PERMITTED, _) => {
                 Err(fault(action(), 4, "an input cannot be written"))
             }
             (tags::FEED | tags::DISCHARGE | tags::MAGNET | tags::PRESENT, _) => {

@@ -24,6 +24,7 @@ pub mod kinematics;
 pub mod layout;
 mod log;
 mod mechanics;
+mod operator;
 mod score;
 #[cfg(test)]
 mod tests;
@@ -59,6 +60,8 @@ pub struct SimSettings {
     pub excluded_share: f64,
     /// How far the arms depart from their data sheet.
     pub arms: ArmErrors,
+    /// What is assumed of screws, bits and persons.
+    pub assumed: Assumed,
     /// What goes wrong, and how often: nothing unless named.
     pub faults: Faults,
 }
@@ -72,7 +75,55 @@ impl Default for SimSettings {
             decoys: true,
             excluded_share: 28.0 / 120.0,
             arms: ArmErrors::default(),
+            assumed: Assumed::default(),
             faults: Faults::none(),
+        }
+    }
+}
+
+/// What nobody has measured: a figure from the simulated cell is a claim about these numbers, and is printed with them.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Assumed {
+    /// A screw that is rusted solid comes loose after impacts for a time that varies from screw to screw; half of them within this, s. Only
+    /// impacts of at least its torque count.
+    pub seized_half_life_s: f64,
+    /// What a filled recess is to the extractor bit, as a share of what it is to the cross bit: it cuts through dirt.
+    pub extractor_fill: f64,
+    /// The same for a rounded recess: it cuts its own grip.
+    pub extractor_wear: f64,
+    /// Time to change the bit at the magazine, the way there and back included, s.
+    pub bit_change_s: f64,
+    /// Time in which the mill takes a head off, s.
+    pub mill_s: f64,
+    /// How far beside a head the mill may stand and still take it off, mm.
+    pub mill_reach_mm: f64,
+    /// Whether the plant's controller permits milling.
+    pub mill_permitted: bool,
+    /// Share of the screws that a person sees in a picture where at least half of the head shows.
+    pub person_sees: f64,
+    /// The same for heads of which less shows, or whose recess is buried.
+    pub person_sees_hidden: f64,
+    /// Time until a person looks at a picture and understands it, s.
+    pub person_look_s: f64,
+    /// Time of a click, s.
+    pub person_click_s: f64,
+}
+
+impl Default for Assumed {
+    fn default() -> Self {
+        Self {
+            seized_half_life_s: 10.0,
+            extractor_fill: 0.6,
+            extractor_wear: 0.4,
+            bit_change_s: 7.0,
+            mill_s: 8.0,
+            mill_reach_mm: 2.0,
+            mill_permitted: true,
+            person_sees: 0.98,
+            person_sees_hidden: 0.7,
+            person_look_s: 6.0,
+            person_click_s: 1.5,
         }
     }
 }
@@ -116,6 +167,22 @@ impl SimSettings {
         ];
         if !errors.iter().all(|v| (0.0..=20.0).contains(v)) {
             return bad("arms", "must hold numbers between 0 and 20");
+        }
+        let a = settings.assumed;
+        let shares = [a.extractor_fill, a.extractor_wear, a.person_sees, a.person_sees_hidden];
+        if !shares.iter().all(|v| (0.0..=1.0).contains(v)) {
+            return bad("assumed", "must hold shares between 0 and 1");
+        }
+        let amounts = [
+            a.seized_half_life_s,
+            a.bit_change_s,
+            a.mill_s,
+            a.mill_reach_mm,
+            a.person_look_s,
+            a.person_click_s,
+        ];
+        if !amounts.iter().all(|v| (0.0..=3600.0).contains(v)) {
+            return bad("assumed", "must hold times and distances between 0 and 3600");
         }
         Ok(settings)
     }
@@ -164,6 +231,7 @@ impl SimulatedCell {
             reader: Arc::new(io::ReaderHandle(world.clone())),
             plant: Arc::new(io::PlantHandle(world.clone())),
             clock: Arc::new(io::ClockHandle(world.clone())),
+            operator: Some(Arc::new(operator::OperatorHandle(world.clone()))),
         };
         Self { devices, world }
     }

@@ -1,6 +1,6 @@
 //! The simulator's truth, for reports and evaluation only: nothing that decides may read it.
 
-use cell::device::DriveEnd;
+use cell::device::{Bit, DriveEnd};
 use scene::{CoverId, Exclusion, FaceId, ScrewId, Theme};
 use serde::{Deserialize, Serialize};
 
@@ -39,6 +39,21 @@ pub enum ActionKind {
         aim: Option<Aim>,
         /// How it ended.
         end: DriveEnd,
+        /// How long impacts of at least the screw's torque went on, s.
+        #[serde(default)]
+        impacts_s: f64,
+    },
+    /// A person was shown a picture.
+    Asked {
+        /// How many clicks came back.
+        clicks: usize,
+    },
+    /// The bit of a driver was changed.
+    Mounted {
+        /// On which arm.
+        arm: String,
+        /// It carries this one now.
+        bit: Bit,
     },
     /// The gripper pulled at a cover.
     Pull {

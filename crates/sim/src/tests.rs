@@ -12,6 +12,7 @@ const PROGRAM: DriveProgram = DriveProgram {
     max_time_s: 2.5,
     max_torque_nm: 12.0,
     stroke_mm: 10.0,
+    bit: cell::device::Bit::Cross,
 };
 
 fn run<T>(future: impl Future<Output = T>) -> T {

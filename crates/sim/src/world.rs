@@ -1,13 +1,13 @@
 //! The physical world that all devices of one cell share: time, the unit on the table, what is off it, the arms.
 
-use crate::SimSettings;
 use crate::arm::SimArm;
 use crate::draw::{draw, mix, signed};
 use crate::faults::{Fault, FaultDraws};
 use crate::layout;
 use crate::log::ActionLog;
 use crate::score::{Action, ActionKind, Score, ScrewScore, UnitScore};
-use cell::device::DriveEnd;
+use crate::{Assumed, SimSettings};
+use cell::device::{Bit, DriveEnd};
 use geometry::{Base, Camera, CameraModel, Face, Point, Tool, Transform};
 use nalgebra::{UnitQuaternion, Vector3};
 use rand::RngExt;
@@ -35,14 +35,15 @@ const DEEPEST_MM: f64 = 8.0;
 /// Nothing may go below this height above the arm's foot, mm: the table.
 const TABLE_TOP_MM: f64 = 90.0;
 
-/// A job that has to do with covers.
+/// A job of an arm that leaves something changed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum CoverJob {
+pub(crate) enum ArmJob {
     Pull(CoverId),
     Drop,
+    Mount(Bit),
 }
 
-impl CoverJob {
+impl ArmJob {
     /// Covers that a job exists for; the left one leaves with the front.
     pub(crate) fn pulls() -> impl Iterator<Item = CoverId> {
         [CoverId::Top, CoverId::Front, CoverId::Right].into_iter()
@@ -63,6 +64,8 @@ pub(crate) struct LoadedUnit {
     pub(crate) removed: BTreeSet<ScrewId>,
     pub(crate) covers_off: BTreeSet<CoverId>,
     pub(crate) attempts: BTreeMap<ScrewId, u32>,
+    /// How long each screw has been hammered at its torque, s.
+    pub(crate) impacts_s: BTreeMap<ScrewId, f64>,
     pub(crate) presented: Option<FaceId>,
     truths: BTreeMap<FaceId, Arc<FaceTruth>>,
     score: UnitScore,
@@ -141,6 +144,10 @@ impl World {
         self.settings.seed
     }
 
+    pub(crate) fn assumed(&self) -> Assumed {
+        self.settings.assumed
+    }
+
     /// Lets time pass.
     pub(crate) fn pass(&mut self, s: f64) {
         self.advance_to(self.t_s + s.max(0.0));
@@ -171,10 +178,15 @@ impl World {
         }
         for i in 0..self.arms.len() {
             match self.arms[i].settle(now_s) {
-                Some(CoverJob::Pull(cover)) => self.pull(i, cover),
-                Some(CoverJob::Drop) => {
+                Some(ArmJob::Pull(cover)) => self.pull(i, cover),
+                Some(ArmJob::Drop) => {
                     self.held_cover = None;
                     self.record(ActionKind::LaidAside);
+                }
+                Some(ArmJob::Mount(bit)) => {
+                    self.arms[i].bit = bit;
+                    let arm = self.arms[i].name.clone();
+                    self.record(ActionKind::Mounted { arm, bit });
                 }
                 None => {}
             }
@@ -211,9 +223,17 @@ impl World {
                     self.truth();
                 }
                 ActionKind::Drive {
-                    screw: Some(id), end, ..
-                } => self.driven(*id, *end),
-                ActionKind::Drive { .. } => {}
+                    screw: Some(id),
+                    end,
+                    impacts_s,
+                    ..
+                } => self.driven(*id, *end, *impacts_s),
+                ActionKind::Drive { .. } | ActionKind::Asked { .. } => {}
+                ActionKind::Mounted { arm, bit } => {
+                    if let Some(arm) = self.arms.iter_mut().find(|a| a.name == *arm) {
+                        arm.bit = *bit;
+                    }
+                }
                 ActionKind::Pull { cover, off, .. } => {
                     self.held_cover = off.then_some(*cover);
                     if let Some(loaded) = self.unit.as_mut().filter(|_| *off) {
@@ -312,6 +332,7 @@ impl World {
             removed: BTreeSet::new(),
             covers_off: BTreeSet::new(),
             attempts: BTreeMap::new(),
+            impacts_s: BTreeMap::new(),
             presented: None,
             truths: BTreeMap::new(),
         });
@@ -472,8 +493,9 @@ impl World {
     }
 
     /// Notes what the driver did to a screw.
-    pub(crate) fn driven(&mut self, screw: ScrewId, end: DriveEnd) {
+    pub(crate) fn driven(&mut self, screw: ScrewId, end: DriveEnd, impacts_s: f64) {
         let Some(loaded) = &mut self.unit else { return };
+        *loaded.impacts_s.entry(screw).or_default() += impacts_s;
         *loaded.attempts.entry(screw).or_default() += 1;
         if end == DriveEnd::Removed {
             loaded.removed.insert(screw);

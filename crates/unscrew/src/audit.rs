@@ -163,6 +163,7 @@ mod tests {
                 screw: None,
                 aim: None,
                 end: DriveEnd::Removed,
+                impacts_s: 0.0,
             },
         }
     }

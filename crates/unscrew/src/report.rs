@@ -2,9 +2,10 @@
 
 use anyhow::{Context, Result};
 use cell::{
-    record::{FaceRecord, Found, Outcome, Purpose, ScrewAttempt, Times, UnitRecord, Verdict},
+    record::{Assist, FaceRecord, Found, Method, Outcome, Purpose, ScrewAttempt, Times, UnitRecord, Verdict},
     statistics::{Rate, Statistics},
 };
+use geometry::{Base, Point};
 use std::{collections::HashMap, fmt::Write as _, path::Path};
 
 /// The paper's figures, section 5 (120 units).
@@ -186,10 +187,24 @@ fn rate_row(page: &mut String, name: &str, rate: &Rate, paper: &str) -> Result<(
     Ok(())
 }
 
+/// How a unit was finished, in words.
+fn with_help(record: &UnitRecord) -> String {
+    let help = match record.assist {
+        Assist::None => "",
+        Assist::Remote => ", with a person's clicks",
+        Assist::Hand => ", with a person's hand",
+    };
+    let cost = match record.method {
+        Method::NonDestructive => "",
+        Method::Destructive => ", heads milled off",
+    };
+    format!("every cover is off{help}{cost}")
+}
+
 fn unit(page: &mut String, folder: &Path, report: &Report, record: &UnitRecord) -> Result<()> {
     let (badge, class, detail) = match &record.outcome {
         None => ("under way", "open", String::new()),
-        Some(Outcome::Ok) => ("OK", "ok", "every cover is off".into()),
+        Some(Outcome::Ok) => ("OK", "ok", with_help(record)),
         Some(Outcome::Ng { detail, .. }) => ("NG", "ng", detail.clone()),
         Some(Outcome::Excluded { detail, .. }) => ("excluded", "excluded", detail.clone()),
     };
@@ -310,6 +325,7 @@ fn figure(
             Purpose::Survey => "survey, nothing touched".into(),
             Purpose::Work => escape(&face.step_name),
             Purpose::Missed => "looked again for missed screws".into(),
+            Purpose::Clicked => "looked again with a person's clicks".into(),
         },
         face.removed(),
         if retries > 0 {
@@ -382,7 +398,9 @@ fn result(face: &FaceRecord, index: usize, found: &Found) -> String {
         };
     };
     let end = match attempt.end() {
+        _ if attempt.milled() && attempt.removed() => "milled off",
         _ if attempt.removed() => "taken out",
+        _ if attempt.absent() => "no screw there after all",
         Some(cell::device::DriveEnd::Removed) => "driver said out, picture says it is still there",
         Some(cell::device::DriveEnd::CamOut) => "bit slipped out",
         Some(cell::device::DriveEnd::Seized) => "seized",
@@ -391,8 +409,18 @@ fn result(face: &FaceRecord, index: usize, found: &Found) -> String {
         None => "a device failed before the driver ran",
     };
     let tries = attempt.bursts.len();
+    let decision = attempt.decision.as_ref().map_or(String::new(), |d| {
+        let at = |p: &Point<Base>| format!("({:.1}, {:.1}, {:.1})", p.x_mm(), p.y_mm(), p.z_mm());
+        let path = d.path.iter().map(at).collect::<Vec<_>>().join(" to ");
+        let cutter = if path.is_empty() {
+            path
+        } else {
+            format!("; cutter from {path} mm")
+        };
+        format!(" · {}{cutter}", d.because)
+    });
     format!(
-        "{end}, {} by {}, {:.1} s",
+        "{end}, {} by {}, {:.1} s{decision}",
         if tries == 1 {
             "one attempt".into()
         } else {

@@ -16,7 +16,7 @@ use cell::{
     capture_pairs as capture,
     config::Backend,
     device::Devices,
-    record::{FaceRecord, PullEnd, Verdict},
+    record::{Assist, FaceRecord, Method, PullEnd, Verdict},
 };
 use geometry::{Base, Direction};
 use indicatif::ProgressBar;
@@ -49,6 +49,12 @@ pub struct Args {
     /// Cell file (TOML); left out, the simulated cell
     #[arg(long, value_name = "FILE")]
     cell: Option<PathBuf>,
+    /// A person may be asked to click on screws in pictures (as `click = true` under [help] in the cell file)
+    #[arg(long)]
+    click: bool,
+    /// Heads may be milled off where product description and plant controller allow it (as `mill = true` under [destructive])
+    #[arg(long)]
+    mill: bool,
     /// Go on with the run in --out, in the middle of a unit if need be
     #[arg(long)]
     resume: bool,
@@ -76,10 +82,12 @@ pub fn run(args: &Args) -> Result<Ended> {
             args.out.display()
         );
     }
-    let config = match &args.cell {
+    let mut config = match &args.cell {
         Some(path) => CellConfig::read(path)?,
         None => CellConfig::simulated(),
     };
+    config.help.click |= args.click;
+    config.destructive.mill |= args.mill;
     let detector = args.model.detector()?;
     let Backend::Simulated = config.backend;
     let settings = SimSettings {
@@ -94,12 +102,19 @@ pub fn run(args: &Args) -> Result<Ended> {
     let stop = output::stop_on_ctrl_c();
     let (maps, calibration) = runtime.block_on(calibrated(&settings, &simulated.devices, &config, args, &stop))?;
     let provenance = format!(
-        "{} units of seed {}, cell seed {}, model {}, unscrew {}.",
+        "{} units of seed {}, cell seed {}, model {}, unscrew {}; a person's clicks {}, milling {}. Simulated: a claim about {}.",
         args.units,
         args.seed,
         settings.seed,
         detector.model().id(),
-        env!("CARGO_PKG_VERSION")
+        env!("CARGO_PKG_VERSION"),
+        if config.help.click { "allowed" } else { "not allowed" },
+        if config.destructive.mill {
+            "allowed"
+        } else {
+            "not allowed"
+        },
+        assumptions(&settings),
     );
     let journal = Journal::open(&args.out)?;
     let mut runner = Runner::new(
@@ -110,6 +125,8 @@ pub fn run(args: &Args) -> Result<Ended> {
         config,
         journal,
     )?;
+    // whoever runs this command asks for the start; with --resume too, and again after every stop
+    runner.start()?;
     let live = Live::new(&simulated, args.units, args.json);
     let mut records = runner.journal().records()?;
     let finish = |records: &[UnitRecord]| write_results(args, records, &live, &calibration, &provenance);
@@ -130,6 +147,7 @@ pub fn run(args: &Args) -> Result<Ended> {
             ));
         }
     }
+    runner.complete();
     live.bar.finish_and_clear();
     if let Some(error) = simulated.log_error() {
         bail!("the simulated world's log could not be written: {error}");
@@ -138,7 +156,7 @@ pub fn run(args: &Args) -> Result<Ended> {
     if args.json {
         println!(
             "{}",
-            serde_json::to_string_pretty(&summary(&statistics, &records, &calibration))?
+            serde_json::to_string_pretty(&summary(&statistics, &records, &calibration, &provenance))?
         );
     } else {
         print!("{}", stats::text(&statistics));
@@ -156,6 +174,22 @@ pub fn run(args: &Args) -> Result<Ended> {
     } else {
         Ended::NotGoodEnough
     })
+}
+
+/// What a simulated figure rests on, in one line.
+fn assumptions(settings: &SimSettings) -> String {
+    let shares = format!(
+        "wear {}, {:.0} % of the units spoilt",
+        settings.wear,
+        100.0 * settings.excluded_share
+    );
+    match serde_json::to_value(settings.assumed) {
+        Ok(serde_json::Value::Object(assumed)) => {
+            let pairs = assumed.iter().map(|(key, value)| format!("{key} {value}"));
+            format!("{shares}, {}", pairs.collect::<Vec<_>>().join(", "))
+        }
+        _ => shares,
+    }
 }
 
 /// A map for every arm: those in the folder if they are this cell's, else captured and fitted now.
@@ -399,6 +433,8 @@ impl Observer for Live<'_> {
 #[derive(Serialize)]
 struct Summary<'a> {
     statistics: &'a Statistics,
+    /// What was run, with which policy, and what the simulation assumes.
+    provenance: &'a str,
     calibration: &'a str,
     units: Vec<UnitLine<'a>>,
 }
@@ -409,22 +445,32 @@ struct UnitLine<'a> {
     model: Option<&'a str>,
     #[serde(flatten)]
     outcome: Option<&'a Outcome>,
+    assist: Assist,
+    method: Method,
     screws_removed: usize,
     cycle_s: f64,
     times: &'a cell::record::Times,
 }
 
-fn summary<'a>(statistics: &'a Statistics, records: &'a [UnitRecord], calibration: &'a str) -> Summary<'a> {
+fn summary<'a>(
+    statistics: &'a Statistics,
+    records: &'a [UnitRecord],
+    calibration: &'a str,
+    provenance: &'a str,
+) -> Summary<'a> {
     let line = |r: &'a UnitRecord| UnitLine {
         unit: r.unit,
         model: r.model.as_deref(),
         outcome: r.outcome.as_ref(),
+        assist: r.assist,
+        method: r.method,
         screws_removed: r.faces.iter().map(FaceRecord::removed).sum(),
         cycle_s: r.times.cycle_s(),
         times: &r.times,
     };
     Summary {
         statistics,
+        provenance,
         calibration,
         units: records.iter().map(line).collect(),
     }
@@ -448,7 +494,7 @@ fn write_results(
     report::write(&args.out, &page)?;
     output::write_json(
         &args.out.join("summary.json"),
-        &summary(&statistics, records, calibration),
+        &summary(&statistics, records, calibration, provenance),
     )?;
     Ok(statistics)
 }

@@ -89,13 +89,15 @@ pub fn text(s: &Statistics) -> String {
     };
     let time = |t: Option<f64>| t.map_or("    -".into(), |t| format!("{t:5.1} s"));
     let mut text = format!(
-        "units      {} ({} OK, {} NG, {} excluded)\nin scope   {}\nof all     {}\nscrews out {}\nmean cycle {} (OK {}, NG {})\n",
+        "units      {} ({} OK, {} NG, {} excluded)\nin scope   {}\nof all     {}\n  unaided  {}\n  by click {}\nscrews out {}\nmean cycle {} (OK {}, NG {})\n",
         s.units,
         s.ok,
         s.ng,
         s.excluded,
         rate(&s.ok_in_scope),
         rate(&s.ok_of_all),
+        rate(&s.ok_unaided),
+        rate(&s.ok_with_click),
         rate(&s.screws_removed),
         time(s.cycle_mean_s),
         time(s.cycle_ok_mean_s),

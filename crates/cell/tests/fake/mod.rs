@@ -67,6 +67,16 @@ pub struct World {
     /// The call of this name with this number never returns: the program dies there. The flag says whether it took effect.
     pub die_at: Option<(&'static str, usize, bool)>,
     pub calls: BTreeMap<&'static str, usize>,
+    /// The safety chain is closed.
+    pub safe: bool,
+    /// It opens at this burst.
+    pub unsafe_at_burst: Option<usize>,
+    /// The bit of the first arm.
+    pub bit: String,
+    /// The plant's controller permits milling.
+    pub mill_permitted: bool,
+    /// Where a person clicks, by face, on the face, mm.
+    pub clicks: BTreeMap<String, Vec<[f64; 2]>>,
 }
 
 /// The world, and word of the program's death.
@@ -98,6 +108,11 @@ impl Fake {
                 lie_at_burst: None,
                 die_at: None,
                 calls: BTreeMap::new(),
+                safe: true,
+                unsafe_at_burst: None,
+                bit: "cross".into(),
+                mill_permitted: false,
+                clicks: BTreeMap::new(),
             })),
             Arc::new(tokio::sync::Notify::new()),
         )
@@ -130,6 +145,7 @@ impl Fake {
             reader: Arc::new(self.clone()),
             plant: Arc::new(self.clone()),
             clock: Arc::new(self.clone()),
+            operator: Some(Arc::new(self.clone())),
         }
     }
 
@@ -389,6 +405,12 @@ impl RobotArm for FakeArm {
         if job == jobs::HOME {
             return Ok(Ticket(0));
         }
+        if let Some(bit) = job.strip_prefix("MOUNT_") {
+            let mut world = self.fake.world();
+            world.log.push(job.to_owned());
+            world.bit = bit.to_lowercase();
+            return Ok(Ticket(0));
+        }
         let (n, dies) = self.fake.call("job", 5.0);
         if dies == Some(false) {
             self.fake.die().await;
@@ -458,6 +480,10 @@ impl DriverTool for Fake {
                 "drive {face} {:.0} N {:.1} s",
                 program.axial_force_n, program.max_time_s
             ));
+            assert_eq!(program.bit.name(), world.bit, "the bit is mounted before it is used");
+            if world.unsafe_at_burst == Some(n) {
+                world.safe = false;
+            }
             end
         };
         if dies == Some(true) {
@@ -483,6 +509,9 @@ impl CellIo for Fake {
             tags::LOADED => TagValue::Bool(world.loaded),
             tags::PRESENTED => TagValue::Text(world.presented.clone()),
             tags::GRIPPER_HOLDING => TagValue::Bool(world.holding),
+            tags::SAFETY_OK => TagValue::Bool(world.safe),
+            tags::MILL_PERMITTED => TagValue::Bool(world.mill_permitted),
+            "arm_a/bit" => TagValue::Text(world.bit.clone()),
             _ => TagValue::Bool(false),
         })
     }
@@ -514,6 +543,22 @@ impl CellIo for Fake {
         } else {
             Err(timeout("io", tag))
         }
+    }
+}
+
+#[async_trait]
+impl Operator for Fake {
+    async fn point_at_screws(&self, question: &Question, _: f64) -> Result<Vec<[f64; 2]>, DeviceError> {
+        let world = self.world();
+        let clicks = world.clicks.get(&world.presented).cloned().unwrap_or_default();
+        let tilt = world.tilt_rad.get(&world.presented).copied().unwrap_or(0.0);
+        let camera = camera();
+        let pixels = clicks.into_iter().filter_map(|at| camera.project(on_face(at, tilt)));
+        let whole = pixels.map(|p| [p.u_px, p.v_px]);
+        let region = question.region;
+        Ok(whole
+            .filter(|p| p[0] >= f64::from(region.x_px) && p[1] >= f64::from(region.y_px))
+            .collect())
     }
 }
 
