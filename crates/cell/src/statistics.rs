@@ -115,6 +115,44 @@ impl Statistics {
     }
 }
 
+/// What one shift's units say.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Shift {
+    /// When it began, cell clock, s.
+    pub from_s: f64,
+    /// Finished units.
+    pub units: usize,
+    /// OK of those in scope.
+    pub ok_in_scope: Rate,
+    /// OK of all.
+    pub ok_of_all: Rate,
+    /// Mean cycle over OK and NG units, s.
+    pub cycle_mean_s: Option<f64>,
+}
+
+/// The trend: units by the shift in which they were begun. Shifts without a unit are left out.
+///
+/// # Arguments
+/// * `shift_s` – length of a shift, s; more than 0.
+pub fn by_shift(records: &[UnitRecord], shift_s: f64) -> Vec<Shift> {
+    let mut shifts: BTreeMap<u64, Vec<UnitRecord>> = BTreeMap::new();
+    for record in records.iter().filter(|r| r.outcome.is_some()) {
+        let shift = (record.started_s.max(0.0) / shift_s.max(1e-9)) as u64;
+        shifts.entry(shift).or_default().push(record.clone());
+    }
+    let of = |(shift, records): (u64, Vec<UnitRecord>)| {
+        let s = Statistics::over(&records);
+        Shift {
+            from_s: shift as f64 * shift_s,
+            units: s.units,
+            ok_in_scope: s.ok_in_scope,
+            ok_of_all: s.ok_of_all,
+            cycle_mean_s: s.cycle_mean_s,
+        }
+    };
+    shifts.into_iter().map(of).collect()
+}
+
 fn mean_cycle_s(records: &[&UnitRecord]) -> Option<f64> {
     (!records.is_empty()).then(|| records.iter().map(|r| r.times.cycle_s()).sum::<f64>() / records.len() as f64)
 }
@@ -173,5 +211,29 @@ mod tests {
         assert!((s.times_mean.screws_s - 160.0).abs() < 1e-9);
         assert_eq!(s.causes["ng: screw_seized"], 1);
         assert_eq!(s.causes["excluded: cover_bent"], 1);
+    }
+    #[test]
+    fn shifts_are_told_apart_by_when_a_unit_was_begun() {
+        let begun = |n: u64, at_s: f64, outcome| UnitRecord {
+            outcome,
+            ..UnitRecord::new(n, at_s)
+        };
+        let ng = Outcome::Ng {
+            reason: NgReason::CoverStuck,
+            detail: String::new(),
+        };
+        let hour = 3600.0;
+        let records = [
+            begun(1, 0.0, Some(Outcome::Ok)),
+            begun(2, 7.9 * hour, Some(ng)),
+            begun(3, 17.0 * hour, Some(Outcome::Ok)),
+            begun(4, 17.5 * hour, None),
+        ];
+        let shifts = by_shift(&records, 8.0 * hour);
+        assert_eq!(
+            shifts.iter().map(|s| (s.from_s / hour, s.units)).collect::<Vec<_>>(),
+            [(0.0, 2), (16.0, 1)]
+        );
+        assert_eq!(shifts[0].ok_of_all.rate, Some(0.5));
     }
 }

@@ -6,7 +6,7 @@ use anyhow::Result;
 use cell::{
     forecast::{Assumptions, Prediction, predictions},
     journal::Journal,
-    statistics::Statistics,
+    statistics::{Rate, Shift, Statistics, by_shift},
 };
 use serde::Serialize;
 use std::path::PathBuf;
@@ -18,9 +18,21 @@ use std::path::PathBuf;
 pub struct Args {
     /// Folder of a run (holds journal.db)
     run: PathBuf,
+    /// Length of a shift, hours: with more than one, rates by shift are told too
+    #[arg(long, value_name = "HOURS", default_value_t = 8.0, value_parser = shift_length)]
+    shift_h: f64,
     /// As JSON
     #[arg(long)]
     json: bool,
+}
+
+fn shift_length(text: &str) -> Result<f64, String> {
+    let hours: f64 = text.parse().map_err(|_| format!("'{text}' is no number of hours"))?;
+    if (0.01..=1000.0).contains(&hours) {
+        Ok(hours)
+    } else {
+        Err("expected 0.01 to 1000 hours".into())
+    }
 }
 
 /// What `--json` prints.
@@ -32,6 +44,8 @@ struct Printed {
     actions: Option<Actions>,
     /// What its screws' scores said of each unit in scope beforehand, under the assumptions of `unscrew simulate`, and what became of it.
     predictions: Vec<Prediction>,
+    /// The trend.
+    shifts: Vec<Shift>,
 }
 
 pub fn run(args: &Args) -> Result<Ended> {
@@ -44,16 +58,31 @@ pub fn run(args: &Args) -> Result<Ended> {
         .then(|| audit(&journal, &sim::read_actions(&world)?))
         .transpose()?;
     let predictions = predictions(&Assumptions::default(), &records);
+    let shifts = by_shift(&records, 3600.0 * args.shift_h);
     if args.json {
         let printed = Printed {
             statistics,
             actions,
             predictions,
+            shifts,
         };
         println!("{}", serde_json::to_string_pretty(&printed)?);
         return Ok(Ended::Good);
     }
     print!("{}", text(&statistics));
+    if shifts.len() > 1 {
+        for shift in &shifts {
+            println!(
+                "  from {:5.1} h: {} units, {} OK of those in scope, {}",
+                shift.from_s / 3600.0,
+                shift.units,
+                percent(&shift.ok_in_scope),
+                shift
+                    .cycle_mean_s
+                    .map_or("no cycle".into(), |t| format!("mean cycle {t:.0} s")),
+            );
+        }
+    }
     if !predictions.is_empty() {
         let n = predictions.len() as f64;
         let square = |p: &Prediction| (p.predicted - f64::from(u8::from(p.finished))).powi(2);
@@ -74,9 +103,8 @@ pub fn run(args: &Args) -> Result<Ended> {
     Ok(Ended::Good)
 }
 
-/// The statistics as a table for a terminal.
-pub fn text(s: &Statistics) -> String {
-    let rate = |r: &cell::statistics::Rate| match r.rate {
+fn percent(r: &Rate) -> String {
+    match r.rate {
         Some(p) => format!(
             "{:5.1} %  ({} of {}; 95 %: {:.1} to {:.1} %)",
             100.0 * p,
@@ -86,7 +114,12 @@ pub fn text(s: &Statistics) -> String {
             100.0 * r.high
         ),
         None => "    -".into(),
-    };
+    }
+}
+
+/// The statistics as a table for a terminal.
+pub fn text(s: &Statistics) -> String {
+    let rate = percent;
     let time = |t: Option<f64>| t.map_or("    -".into(), |t| format!("{t:5.1} s"));
     let mut text = format!(
         "units      {} ({} OK, {} NG, {} excluded)\nin scope   {}\nof all     {}\n  unaided  {}\n  by click {}\nscrews out {}\nmean cycle {} (OK {}, NG {})\n",
@@ -103,6 +136,11 @@ pub fn text(s: &Statistics) -> String {
         time(s.cycle_ok_mean_s),
         time(s.cycle_ng_mean_s),
     );
+    let t = &s.times_mean;
+    text.push_str(&format!(
+        "           handling {:.1}, screws {:.1}, covers {:.1}, inspection {:.1}, recovery {:.1}; waiting {:.1} s besides\n",
+        t.handling_s, t.screws_s, t.covers_s, t.inspection_s, t.recovery_s, t.waiting_s
+    ));
     for (cause, count) in &s.causes {
         text.push_str(&format!("  {count:3} x {}\n", cause.replace('_', " ")));
     }
