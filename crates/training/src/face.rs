@@ -29,7 +29,17 @@ pub fn drive_seen(drive: scene::fastener::Drive) -> vision::Drive {
 
 /// Renders a face; `None` where the product does not have it.
 pub fn shot(product: &Unit, face: FaceId, seed: u64) -> Option<Shot> {
-    let view = FaceView::sample(product, face, seed)?;
+    Some(of(FaceView::sample(product, face, seed)?))
+}
+
+/// Renders a face from which every screw has been taken out: their holes are left, and all that may be taken for a screw.
+pub fn shot_without_screws(product: &Unit, face: FaceId, seed: u64) -> Option<Shot> {
+    let mut view = FaceView::sample(product, face, seed)?;
+    view.removed_screws = view.design.screws.iter().map(|s| s.id).collect();
+    Some(of(view))
+}
+
+fn of(view: FaceView) -> Shot {
     let prepared = Prepared::new(&view);
     let truth = prepared.truth();
     let picture = prepared.render(None);
@@ -39,5 +49,5 @@ pub fn shot(product: &Unit, face: FaceId, seed: u64) -> Option<Shot> {
         camera: Some(view.camera),
         t_s: 0.0,
     };
-    Some(Shot { frame, truth })
+    Shot { frame, truth }
 }

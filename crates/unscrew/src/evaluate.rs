@@ -34,6 +34,9 @@ pub struct Args {
     /// Rendered gauges with nothing but screws, as in the paper, instead of worn units
     #[arg(long, conflicts_with_all = ["truth", "photos"])]
     gauge: bool,
+    /// Rendered faces from which every screw has been taken out: every find is a false one
+    #[arg(long, conflicts_with_all = ["truth", "photos", "gauge"])]
+    bare: bool,
     /// Folder with rgb/*.jpg, depth/*.png and truth/*.json, instead of rendered faces
     #[arg(long, value_name = "DIR", conflicts_with_all = ["faces", "seed", "photos"])]
     truth: Option<PathBuf>,
@@ -111,7 +114,11 @@ pub fn run(args: &Args) -> Result<Ended> {
             })
         }
         None => {
-            let product = if args.gauge { Product::Gauge } else { Product::Units };
+            let product = match (args.gauge, args.bare) {
+                (true, _) => Product::Gauge,
+                (_, true) => Product::Bare,
+                _ => Product::Units,
+            };
             let seeds = args.seed..args.seed.saturating_add(args.faces);
             measure(args, evaluator, seeds, args.faces, |e, seed| e.face(product, seed))
         }

@@ -17,7 +17,7 @@ use super::{
     Coverage, EvaluateError, FalseFind, Miss, Quantiles, Share, cut, list, percent, read_text, speaker, unreadable,
     word, write_lists,
 };
-use crate::face::{Shot, face_of, shot};
+use crate::face::{Shot, face_of, shot, shot_without_screws};
 
 /// Seeds from here on are for evaluation, smaller ones for training.
 pub const FIRST_EVALUATION_SEED: u64 = 1_000_000;
@@ -38,6 +38,8 @@ pub enum Product {
     Units,
     /// The paper's gauge: a plate with nothing but screws.
     Gauge,
+    /// Worn outdoor units from which every screw has been taken out.
+    Bare,
 }
 
 /// Source of figures on [`Product::Gauge`].
@@ -259,14 +261,23 @@ impl<'a> Evaluator<'a> {
         if seed < FIRST_EVALUATION_SEED {
             return Err(EvaluateError::TrainingSeed { seed });
         }
-        let (unit, face, source) = match product {
-            Product::Units => (Unit::sample(seed), face_of(seed), "rendered faces of outdoor units"),
-            Product::Gauge => (Unit::gauge(seed), FaceId::Front, GAUGES),
+        let (shot, face) = match product {
+            Product::Units => (shot(&Unit::sample(seed), face_of(seed), seed), face_of(seed)),
+            Product::Gauge => (shot(&Unit::gauge(seed), FaceId::Front, seed), FaceId::Front),
+            Product::Bare => (
+                shot_without_screws(&Unit::sample(seed), face_of(seed), seed),
+                face_of(seed),
+            ),
+        };
+        let source = match product {
+            Product::Units => "rendered faces of outdoor units",
+            Product::Gauge => GAUGES,
+            Product::Bare => "rendered faces of outdoor units without a screw",
         };
         self.source = source.into();
         let [first, last] = self.seeds.unwrap_or([seed; 2]);
         self.seeds = Some([first.min(seed), last.max(seed)]);
-        let Some(Shot { frame, truth }) = shot(&unit, face, seed) else {
+        let Some(Shot { frame, truth }) = shot else {
             return Ok(()); // a unit without that face
         };
         let truth = Truth::of_face(format!("{seed} {}", face.name()), face.name(), &truth);
