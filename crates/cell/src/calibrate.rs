@@ -227,15 +227,28 @@ async fn find(
 ) -> Result<Look, DeviceError> {
     let look = |shot: &Shot| locate_marker(&shot.frame, &settings.marker).map(|m| (shot.to_whole(m.marker.pixel), m));
     let camera = devices.color.intrinsics();
+    let region = |pixel: Pixel| region_around(&camera, pixel, settings.region_px);
     let expected = predict(command, before).and_then(|point| camera.project(point));
-    if let Some(region) = expected.and_then(|pixel| region_around(&camera, pixel, settings.region_px)) {
+    if let Some(region) = expected.and_then(region) {
         let shot = shoot(devices, Some(region), settings.depth_frames).await?;
         if let Ok(seen) = look(&shot) {
             return Ok((shot.frame.t_s, Ok(seen), Some(shot.frame.color)));
         }
     }
-    let shot = shoot(devices, None, settings.depth_frames).await?;
+    // one whole picture tells where it is; the frames to average are those of its region
+    let shot = shoot(devices, None, 1).await?;
     let seen = look(&shot);
+    if let Some(region) = seen
+        .as_ref()
+        .ok()
+        .and_then(|(pixel, _)| region(*pixel))
+        .filter(|_| settings.depth_frames > 1)
+    {
+        let near = shoot(devices, Some(region), settings.depth_frames).await?;
+        if let Ok(seen) = look(&near) {
+            return Ok((near.frame.t_s, Ok(seen), Some(near.frame.color)));
+        }
+    }
     let at = seen.as_ref().map(|s| s.0).ok().or(expected);
     let picture = at.map(|at| {
         let corner = |c: f64| (c - settings.region_px).max(0.0) as u32;

@@ -65,6 +65,11 @@ impl Visits {
             None => scattered(volume, self.points),
         }
     }
+
+    /// Frames of depth at each: the lattice averages over neighbours, scattered points have none.
+    pub fn depth_frames(&self) -> usize {
+        if self.spacing_mm.is_some() { 1 } else { 4 }
+    }
 }
 
 #[derive(clap::Args)]

@@ -289,7 +289,10 @@ async fn capture_with(
         &bench.devices,
         arm,
         &plan,
-        &CaptureSettings::along(approach),
+        &CaptureSettings {
+            depth_frames: visits.depth_frames(),
+            ..CaptureSettings::along(approach)
+        },
         path,
         |visit| {
             bar.set_position(visit.done as u64);
