@@ -2,13 +2,12 @@
 
 mod fake;
 
-use cell::config::CellConfig;
 use cell::device::DriveEnd;
 use cell::journal::Journal;
 use cell::program::Program;
 use cell::record::{Act, ExclusionReason, LeftAlone, NgReason, Outcome, PullEnd, Purpose, SeenBy, UnitRecord};
 use cell::run::{RunError, Runner, Silent};
-use fake::{Fake, base_from_camera, map, screw, screw_that_ends, volume};
+use fake::{Fake, base_from_camera, config, map, screw, screw_that_ends, volume};
 use geometry::Point;
 use std::path::Path;
 use std::sync::Arc;
@@ -24,7 +23,7 @@ fn runner_with(fake: &Fake, folder: &Path, program: Program, finder: impl cell::
         Arc::new(finder),
         vec![map()],
         program,
-        CellConfig::simulated(),
+        config(),
         journal,
     )
     .expect("runner")
@@ -535,7 +534,7 @@ fn a_program_for_an_arm_that_is_not_there_is_refused() {
         Arc::new(fake.clone()),
         vec![map()],
         Program::parse(&text, "p.toml").expect("parsed"),
-        CellConfig::simulated(),
+        config(),
         Journal::open(folder.path()).expect("journal"),
     );
     let error = built.expect_err("no such arm");
