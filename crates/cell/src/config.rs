@@ -470,6 +470,11 @@ mod tests {
             error.contains("approach.standoff_mm") && error.contains("10 to 60"),
             "{error}"
         );
+        let text = "name = 'x'\nbackend = 'simulated'\n[[motion.obstacles]]\nname = 'post'\nmiddle_mm = [0, 0, 0]";
+        let error = CellConfig::parse(&format!("{text}\nsize = [1, 1, 1]"), "c.toml").expect_err("unknown key");
+        assert!(error.to_string().contains("size"), "{error}");
+        let error = CellConfig::parse(&format!("{text}\nsize_mm = [1.0, -1.0, 1.0]"), "c.toml").expect_err("no size");
+        assert!(error.to_string().contains("motion.obstacles.size_mm"), "{error}");
         let error = CellConfig::parse("name = 'x'\nbackend = 'hses'", "c.toml")
             .expect_err("backend")
             .to_string();

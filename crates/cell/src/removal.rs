@@ -119,10 +119,9 @@ impl Mover<'_> {
             });
         };
         let state = self.ready().await?;
-        if let Some(via) = self.way(state.joints_rad, target).await? {
-            self.go(via, Motion::Joint).await?;
+        for pose in self.way(state.joints_rad, target).await? {
+            self.go(pose, Motion::Joint).await?;
         }
-        self.to_standoff(target, Motion::Joint).await?;
         let worked = self.work(driver, target, program, burst).await;
         let back = Motion::Linear {
             speed_mm_s: self.approach.retract_mm_s,
@@ -130,13 +129,9 @@ impl Mover<'_> {
         worked.and(self.to_standoff(target, back).await)
     }
 
-    /// Where to go by way of to in front of a target, if not straight there. Where no way is free from where the arm stands, it goes
-    /// home first: from there the target was planned.
-    async fn way(
-        &self,
-        joints_rad: [f64; 6],
-        target: &SafeTarget,
-    ) -> Result<Option<Transform<Base, Tool>>, DeviceError> {
+    /// Poses on the way to in front of a target, itself the last. Where no way is free from where the arm stands, it goes home first:
+    /// from there the target was planned.
+    async fn way(&self, joints_rad: [f64; 6], target: &SafeTarget) -> Result<Vec<Transform<Base, Tool>>, DeviceError> {
         let refused = |reason: String| DeviceError::Refused {
             device: self.robot().name().into(),
             reason,
@@ -151,7 +146,8 @@ impl Mover<'_> {
             }
             checked => checked,
         };
-        way.map(|way| way.via).map_err(|why| refused(why.to_string()))
+        way.map(|way| way.joint.iter().map(|leg| leg.to).collect())
+            .map_err(|why| refused(why.to_string()))
     }
 
     /// From in front of the screw: in, and drive.

@@ -576,7 +576,7 @@ mod tests {
                         .collect();
                     screws += 1;
                     match (&ways[0], &ways[1]) {
-                        (Ok(way), _) => around += usize::from(way.via.is_some()),
+                        (Ok(way), _) => around += usize::from(way.via().is_some()),
                         (Err(_), Ok(_)) => by_second += 1,
                         (Err(a), Err(b)) => {
                             panic!("{:?} ({x}, {y}) of {:?} mm: {a}; {b}", design.id, loaded.unit.size_mm)

@@ -130,10 +130,8 @@ impl From<&Refusal> for LeftAlone {
 /// A way to a screw on which nothing is in the way.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Way {
-    /// The tool where the arm goes by way of, if not straight to in front of the screw.
-    pub via: Option<Transform<Base, Tool>>,
-    /// The joint moves to in front of the screw: one, or two if there is a place between.
-    pub joint: Vec<Trajectory>,
+    /// To in front of the screw: one move, or two by way of a place farther back.
+    pub joint: Vec<JointMove>,
     /// The straight line into it.
     pub approach: Trajectory,
 }
@@ -141,7 +139,28 @@ pub struct Way {
 impl Way {
     /// Time of the joint moves, s.
     pub fn joint_s(&self) -> f64 {
-        self.joint.iter().map(Trajectory::duration_s).sum()
+        self.joint.iter().map(|leg| leg.trajectory.duration_s()).sum()
+    }
+
+    /// Where the arm goes by way of, if not straight to in front of the screw.
+    pub fn via(&self) -> Option<Transform<Base, Tool>> {
+        via(&self.joint)
+    }
+}
+
+/// A move of all joints together.
+#[derive(Clone, Debug, PartialEq)]
+pub struct JointMove {
+    /// Pose of the tool at its end.
+    pub to: Transform<Base, Tool>,
+    /// Joint angles on the way.
+    pub trajectory: Trajectory,
+}
+
+fn via(moves: &[JointMove]) -> Option<Transform<Base, Tool>> {
+    match moves {
+        [first, _, ..] => Some(first.to),
+        _ => None,
     }
 }
 
@@ -256,8 +275,8 @@ impl ArmMotion {
         })?;
         let unit = self.unit.behind(contact.isometry());
         self.sweep(&approach, &unit, Leg::Approach)?;
-        let (via, joint) = self.joint_way(from_rad, approach.begin_rad(), &standoff, &unit)?;
-        Ok(Way { via, joint, approach })
+        let joint = self.joint_way(from_rad, approach.begin_rad(), standoff, &unit)?;
+        Ok(Way { joint, approach })
     }
 
     /// Where to go by way of from in front of a face to the rest; `None` if straight there is free, or no way is known to be.
@@ -268,8 +287,8 @@ impl ArmMotion {
         let here = self.arm.forward(from_rad);
         let face = here.isometry() * nalgebra::Translation3::new(0.0, 0.0, FACE_AHEAD_MM);
         // a way is as free backwards
-        let way = self.joint_way(self.home_rad, from_rad, &here, &self.unit.behind(&face));
-        way.ok().and_then(|(via, _)| via)
+        let moves = self.joint_way(self.home_rad, from_rad, here, &self.unit.behind(&face));
+        moves.ok().and_then(|moves| via(&moves))
     }
 
     /// Joint moves to a pose, by way of another one if need be.
@@ -277,15 +296,16 @@ impl ArmMotion {
         &self,
         from_rad: [f64; 6],
         to_rad: [f64; 6],
-        to: &Transform<Base, Tool>,
+        to: Transform<Base, Tool>,
         unit: &Solid,
-    ) -> Result<(Option<Transform<Base, Tool>>, Vec<Trajectory>), Refusal> {
-        let free = |from_rad, to_rad| {
-            let way = Trajectory::joint(from_rad, to_rad);
-            self.sweep(&way, unit, Leg::Joint).map(|()| way)
+    ) -> Result<Vec<JointMove>, Refusal> {
+        let free = |from_rad, to_rad, to| {
+            let trajectory = Trajectory::joint(from_rad, to_rad);
+            self.sweep(&trajectory, unit, Leg::Joint)
+                .map(|()| JointMove { to, trajectory })
         };
-        let refused = match free(from_rad, to_rad) {
-            Ok(way) => return Ok((None, vec![way])),
+        let refused = match free(from_rad, to_rad, to) {
+            Ok(straight) => return Ok(vec![straight]),
             Err(refused) => refused,
         };
         for [back_mm, up_mm] in VIA_MM {
@@ -293,10 +313,10 @@ impl ArmMotion {
             let moved = nalgebra::Translation3::from(back + Vector3::z() * up_mm) * to.isometry();
             let via = Transform::from_isometry(moved);
             if let Ok(via_rad) = self.arm.inverse(via)
-                && let Ok(second) = free(via_rad, to_rad)
-                && let Ok(first) = free(from_rad, via_rad)
+                && let Ok(second) = free(via_rad, to_rad, to)
+                && let Ok(first) = free(from_rad, via_rad, via)
             {
-                return Ok((Some(via), vec![first, second]));
+                return Ok(vec![first, second]);
             }
         }
         Err(refused)
@@ -459,7 +479,7 @@ mod tests {
         let unit = arm
             .unit
             .behind(tool_pose(Point::new(contact[0], contact[1], contact[2]), ahead).isometry());
-        let moves = way.joint.iter().map(|way| (way, Leg::Joint));
+        let moves = way.joint.iter().map(|leg| (&leg.trajectory, Leg::Joint));
         let all = moves.chain([(&way.approach, Leg::Approach)]);
         all.flat_map(|(way, leg)| (0..=300).map(move |k| (way.at(way.duration_s() * f64::from(k) / 300.0), leg)))
             .map(|(q, leg)| arm.nearest(q, &unit, leg).spare_mm)
@@ -479,11 +499,11 @@ mod tests {
         ] {
             let contact = [1070.0, y, z];
             let way = check(&arm, HOME_RAD, contact).unwrap_or_else(|e| panic!("{contact:?}: {e}"));
-            assert_eq!(way.joint.len(), if way.via.is_some() { 2 } else { 1 });
-            around += usize::from(way.via.is_some());
+            around += usize::from(way.via().is_some());
             // the moves hang together
-            assert_eq!(way.joint[0].begin_rad(), HOME_RAD);
-            assert_eq!(way.joint[way.joint.len() - 1].end_rad(), way.approach.begin_rad());
+            assert_eq!(way.joint[0].trajectory.begin_rad(), HOME_RAD);
+            let last = &way.joint[way.joint.len() - 1].trajectory;
+            assert_eq!(last.end_rad(), way.approach.begin_rad());
             let spare = spare_mm(&arm, &way, contact);
             assert!(spare > -STEP_MM, "{contact:?}: {spare} mm beyond the margin");
         }
@@ -550,11 +570,11 @@ mod tests {
         let arm = arm_among(&[]);
         let way = check(&arm, HOME_RAD, [1070.0, -400.0, 200.0]).expect("free");
         let standoff_rad = way.approach.begin_rad();
-        assert!(way.via.is_some() && arm.via_home(standoff_rad).is_some());
+        assert!(way.via().is_some() && arm.via_home(standoff_rad).is_some());
         assert_eq!(arm.via_home(HOME_RAD), None);
         // from high up it is free
         let high = check(&arm, HOME_RAD, [1070.0, 0.0, 880.0]).expect("free");
-        assert_eq!((high.via, arm.via_home(high.approach.begin_rad())), (None, None));
+        assert_eq!((high.via(), arm.via_home(high.approach.begin_rad())), (None, None));
     }
 
     #[test]
