@@ -45,7 +45,7 @@ pub struct Station {
 
 impl Station {
     /// The simulated cell's arms, 700 mm apart, and its table; a second table stands 1.2 m beside it, in reach of both arms. A lone arm
-    /// carries driver and gripper; of two both drive and the second also pulls.
+    /// carries driver and gripper; of two at one table both drive and the second also pulls; at two tables both do both.
     ///
     /// # Errors
     /// [`StationError::Size`] for other numbers than one or two.
@@ -60,7 +60,7 @@ impl Station {
             driver: true,
             gripper,
         };
-        let mut both = vec![arm("arm_a", 0.0, -300.0, arms == 1), arm("arm_b", 700.0, 1000.0, true)];
+        let mut both = vec![arm("arm_a", 0.0, -300.0, arms == 1 || tables == 2), arm("arm_b", 700.0, 1000.0, true)];
         both.truncate(arms);
         Ok(Self {
             arms: both,

@@ -180,7 +180,7 @@ pub struct Problem {
     pub sides: Vec<String>,
     /// The tasks.
     pub tasks: Vec<Task>,
-    /// The same tasks, but every face takes what no division of its screws between the arms can be below: for bounds only.
+    /// The same tasks, but with ways that no division of a face's screws between the arms can be below: for bounds only.
     #[serde(skip)]
     pub(super) relaxed: Vec<Task>,
 }
@@ -317,8 +317,8 @@ struct Builder<'a> {
     product: &'a Product,
     station: &'a Station,
     sides: &'a [String],
-    /// Modes of a face at a table, and its relaxed one: the same for all units.
-    faces: HashMap<(usize, usize), (Vec<Mode>, Mode)>,
+    /// Ways of doing a face at a table, and relaxed ones: the same for all units.
+    faces: HashMap<(usize, usize), (Vec<Mode>, Vec<Mode>)>,
     tasks: Vec<Task>,
     relaxed: Vec<Task>,
 }
@@ -433,10 +433,10 @@ impl Builder<'_> {
         Ok(self.push(discharge, None))
     }
 
-    fn push(&mut self, task: Task, least: Option<Mode>) -> usize {
+    fn push(&mut self, task: Task, least: Option<Vec<Mode>>) -> usize {
         let mut relaxed = task.clone();
-        if let Some(mode) = least {
-            relaxed.modes = vec![mode];
+        if let Some(modes) = least {
+            relaxed.modes = modes;
         }
         self.tasks.push(task);
         self.relaxed.push(relaxed);
@@ -450,8 +450,8 @@ impl Builder<'_> {
         face.screws_mm.iter().map(at).collect()
     }
 
-    /// Every way of taking out the screws of a face, and what none of them is below.
-    fn face_modes(&mut self, face: usize, table: usize) -> Result<(Vec<Mode>, Mode), ProblemError> {
+    /// Every way of taking out the screws of a face, and ways that no division of its screws between the arms is below.
+    fn face_modes(&mut self, face: usize, table: usize) -> Result<(Vec<Mode>, Vec<Mode>), ProblemError> {
         if let Some(known) = self.faces.get(&(face, table)) {
             return Ok(known.clone());
         }
@@ -494,20 +494,32 @@ impl Builder<'_> {
                 modes.push(self.screws_mode(&parts, &y_mm));
             }
         }
-        let pairs: Vec<(&Costs, Option<&Tours>)> = able.iter().zip(&tours).map(|((_, c), t)| (c, t.as_ref())).collect();
-        let least = tour::least(&pairs);
-        let longest_lead = able.iter().flat_map(|(_, costs)| &costs.out_s).copied().fold(0.0, f64::max);
-        let mut relaxed = modes[0].clone();
-        relaxed.table_s = least.span_s;
-        relaxed.lead_s = longest_lead;
-        relaxed.work_s = least.work_s;
-        relaxed.stops.clear();
-        if able.len() > 1 {
-            relaxed.arms.iter_mut().for_each(|used| *used = None);
-        } else {
-            for used in relaxed.arms.iter_mut().flatten() {
-                used.busy_s = least.span_s;
-                used.strip_s = least.span_s;
+        // the same ways at their least, and the two arms together in classes of divisions
+        let longest_lead_s = able.iter().flat_map(|(_, costs)| &costs.out_s).copied().fold(0.0, f64::max);
+        let mut relaxed: Vec<Mode> = Vec::new();
+        for (((_, costs), tours), mode) in able.iter().zip(&tours).zip(&modes) {
+            let least_s = tour::least_alone_s(costs, tours.as_ref());
+            let mut mode = mode.clone();
+            (mode.table_s, mode.work_s, mode.lead_s) = (least_s, least_s, longest_lead_s);
+            for used in mode.arms.iter_mut().flatten() {
+                (used.busy_s, used.strip_s) = (least_s, least_s);
+            }
+            relaxed.push(mode);
+        }
+        if let [(a, first), (b, second)] = &able[..] {
+            for times_s in tour::least_shared_s([(first, tours[0].as_ref()), (second, tours[1].as_ref())]) {
+                let mut mode = relaxed[0].clone();
+                for (arm, busy_s) in [*a, *b].into_iter().zip(times_s) {
+                    // each is somewhere at its own place of rest, at least
+                    let strip = Strip::over([self.station.arms[arm].rest_y_mm]);
+                    mode.arms[arm] = Some(ArmUse {
+                        busy_s,
+                        strip,
+                        strip_s: 0.0,
+                    });
+                }
+                (mode.table_s, mode.work_s) = (times_s[0].max(times_s[1]), times_s[0] + times_s[1]);
+                relaxed.push(mode);
             }
         }
         let known = (modes, relaxed);
