@@ -124,6 +124,7 @@ pub async fn capture_pairs(
         approach: Approach::default(),
         timeouts: settings.timeouts,
         clock: &devices.clock,
+        motion: None,
     };
     let mut complete = true;
     for target in plan.iter().filter(|t| !known.contains(&t.id)) {

@@ -1,6 +1,7 @@
 //! The cell file: which devices, which limits. TOML, unknown keys refused.
 
 use crate::device::DriveProgram;
+use crate::motion::CellDrawing;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 
@@ -65,6 +66,9 @@ pub struct CellConfig {
     /// How the arms come to a screw.
     #[serde(default)]
     pub approach: Approach,
+    /// What the arms could run into.
+    #[serde(default)]
+    pub motion: CellDrawing,
     /// How screws are driven.
     #[serde(default)]
     pub drive: Drive,
@@ -273,6 +277,7 @@ impl CellConfig {
             inspection: Inspection::default(),
             exclusion: Exclusion::default(),
             approach: Approach::default(),
+            motion: CellDrawing::default(),
             drive: Drive::default(),
             timeouts: Timeouts::default(),
             journal: JournalConfig::default(),
@@ -377,6 +382,46 @@ impl CellConfig {
         for time_s in all {
             within("timeouts.*", time_s, 0.1, 86_400.0, "0.1 s to a day")?;
         }
+        let motion = &self.motion;
+        within("motion.margin_mm", motion.margin_mm, 2.0, 200.0, "2 to 200 mm")?;
+        let unit = &motion.unit;
+        for size_mm in [unit.face_mm[0], unit.face_mm[1], unit.depth_mm] {
+            within("motion.unit.*_mm", size_mm, 1.0, 5000.0, "a size of 1 to 5000 mm")?;
+        }
+        for size_mm in motion.obstacles.iter().flat_map(|block| block.size_mm) {
+            within("motion.obstacles.size_mm", size_mm, 1.0, 100_000.0, "above 1 mm")?;
+        }
+        let drawn = motion.obstacles.iter().map(|block| block.middle_mm);
+        let feet = motion.arms.iter().flat_map(|arm| [arm.foot_mm, arm.tip_mm]);
+        for mm in drawn.chain(feet).chain([unit.middle_mm]).flatten() {
+            within("motion.*_mm", mm, -100_000.0, 100_000.0, "a place within 100 m")?;
+        }
+        for arm in &motion.arms {
+            within("motion.arms.turn_rad", arm.turn_rad, -7.0, 7.0, "a turn at most")?;
+            for angle_rad in arm.home_rad {
+                within("motion.arms.home_rad", angle_rad, -8.0, 8.0, "-8 to 8 rad")?;
+            }
+            let parts = arm.tool.len() as f64;
+            within(
+                "motion.arms.tool, number of capsules",
+                parts,
+                1.0,
+                32.0,
+                "1 to 32, the bit first",
+            )?;
+            for part in &arm.tool {
+                within(
+                    "motion.arms.tool.radius_mm",
+                    part.radius_mm,
+                    0.1,
+                    1000.0,
+                    "0.1 to 1000 mm",
+                )?;
+                for mm in part.from_mm.into_iter().chain(part.to_mm) {
+                    within("motion.arms.tool.*_mm", mm, -3000.0, 3000.0, "-3000 to 3000 mm")?;
+                }
+            }
+        }
         within("timeouts.state_age_s", times.state_age_s, 0.01, 5.0, "0.01 to 5 s")?;
         within(
             "inspection.depth_frames",
@@ -425,6 +470,11 @@ mod tests {
             error.contains("approach.standoff_mm") && error.contains("10 to 60"),
             "{error}"
         );
+        let text = "name = 'x'\nbackend = 'simulated'\n[[motion.obstacles]]\nname = 'post'\nmiddle_mm = [0, 0, 0]";
+        let error = CellConfig::parse(&format!("{text}\nsize = [1, 1, 1]"), "c.toml").expect_err("unknown key");
+        assert!(error.to_string().contains("size"), "{error}");
+        let error = CellConfig::parse(&format!("{text}\nsize_mm = [1.0, -1.0, 1.0]"), "c.toml").expect_err("no size");
+        assert!(error.to_string().contains("motion.obstacles.size_mm"), "{error}");
         let error = CellConfig::parse("name = 'x'\nbackend = 'hses'", "c.toml")
             .expect_err("backend")
             .to_string();

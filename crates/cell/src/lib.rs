@@ -5,7 +5,8 @@
 //! every act is in the journal ([`journal`]) before it is begun. [`run::Runner`] walks through a [`program::Program`], which is data.
 //! What stands behind [`device`]'s traits, a simulated cell or a real one, it cannot tell; nothing here sees a simulator's truth.
 //!
-//! A robot is only ever sent to a [`plan::SafeTarget`], and only a map whose calibrated volume holds the place makes one.
+//! A robot is only ever sent to a [`plan::SafeTarget`], and only a map whose calibrated volume holds the place makes one, once
+//! [`motion`] has found the whole way there free.
 //!
 //! ```
 //! use cell::program::Program;
@@ -35,6 +36,7 @@ pub mod config;
 pub mod device;
 pub mod forecast;
 pub mod journal;
+pub mod motion;
 pub mod plan;
 pub mod program;
 pub mod record;

@@ -1,10 +1,12 @@
 //! From finds to targets: which may be acted on, by which arm, along which line, in which order; and what excludes a unit.
 //!
 //! A robot can only be sent to a [`SafeTarget`], and the only way to get one is from a map whose calibrated volume holds both the
-//! screw and the way to it. What lies at the border or outside is reported, never commanded.
+//! screw and the way to it, and from an arm that can go that way without running into anything. What lies at the border or
+//! outside, or behind something, is reported, never commanded.
 
 use crate::capture::{FaceFit, Shot, sheet_normal, tilt_rad};
-use crate::config::CellConfig;
+use crate::config::{Approach, CellConfig};
+use crate::motion::{ArmMotion, Refusal, Way};
 use crate::record::{ExclusionReason, FaceRecord, Found, Hull, LeftAlone, Verdict};
 use calibration::{Map, MappedPoint};
 use geometry::{Base, Camera, Direction, Point, Tool, Transform};
@@ -16,7 +18,8 @@ const SHORTEST_STANDOFF_MM: f64 = 8.0;
 /// The screws of a face stand no farther in front of its plane or behind it, mm: ribs and sunk flanges.
 const ON_FACE_MM: f64 = 20.0;
 
-/// A place that an arm may be sent to: the point and the straight way to it lie in the calibrated volume of that arm's map.
+/// A place that an arm may be sent to: the point and the straight way to it lie in the calibrated volume of that arm's map, and
+/// the whole way there is free.
 ///
 /// ```compile_fail
 /// // there is no way to make one up
@@ -31,22 +34,32 @@ pub struct SafeTarget {
 }
 
 impl SafeTarget {
-    /// Maps a point seen by the camera into an arm's base.
+    /// Maps a point seen by the camera into an arm's base, and looks at the way there.
     ///
     /// # Arguments
-    /// * `arm` – number of the arm that `map` belongs to.
     /// * `normal` – of the surface, towards the camera: the bit comes against it.
-    /// * `standoff_mm` – length of the straight way in front of the point; shortened where the volume ends before.
+    /// * `approach` – its standoff is shortened where the volume ends before.
     ///
     /// # Errors
-    /// [`LeftAlone::HullEdge`] or [`LeftAlone::HullOutside`], if the point or every straight way to it leaves the volume.
+    /// [`Refused`], if the point or every straight way to it leaves the volume, or the arm cannot go there safely.
     pub fn locate(
-        map: &Map,
-        arm: usize,
+        reach: &Reach<'_>,
+        point: Point<Camera>,
+        normal: Direction<Camera>,
+        approach: &Approach,
+    ) -> Result<Self, Refused> {
+        let place = Self::in_volume(reach, point, normal, approach.standoff_mm)?;
+        place.check(reach.motion, reach.joints_rad, approach)?;
+        Ok(place)
+    }
+
+    fn in_volume(
+        reach: &Reach<'_>,
         point: Point<Camera>,
         normal: Direction<Camera>,
         standoff_mm: f64,
     ) -> Result<Self, LeftAlone> {
+        let map = reach.map;
         let mapped = map.apply(point);
         match mapped.hull {
             Hull::Inside => {}
@@ -65,11 +78,20 @@ impl SafeTarget {
             .ok_or(LeftAlone::HullEdge)?;
         let approach = Direction::from_vector(-outward.vector()).ok_or(LeftAlone::HullEdge)?;
         Ok(Self {
-            arm,
+            arm: reach.arm,
             tip,
             approach,
             standoff_mm,
         })
+    }
+
+    /// Looks at the whole way there from where the arm's joints are.
+    ///
+    /// # Errors
+    /// [`Refusal`], with what is in the way.
+    pub fn check(&self, motion: &ArmMotion, joints_rad: [f64; 6], approach: &Approach) -> Result<Way, Refusal> {
+        let speed_mm_s = approach.approach_mm_s;
+        motion.check(joints_rad, self.standoff_pose(), self.contact_pose(), speed_mm_s)
     }
 
     /// A place so far beside it, across the approach, along the tool's axes; `None` if that or the way to it leaves the volume.
@@ -124,13 +146,60 @@ pub struct Target {
     pub place: SafeTarget,
 }
 
-/// An arm that can take screws out, and its map.
+/// An arm that can take screws out.
 #[derive(Clone, Copy, Debug)]
 pub struct Reach<'a> {
     /// Number of the arm.
     pub arm: usize,
     /// Its map.
     pub map: &'a Map,
+    /// What is around it.
+    pub motion: &'a ArmMotion,
+    /// Where its joints are now, rad.
+    pub joints_rad: [f64; 6],
+}
+
+/// Why an arm is not sent to a find.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Refused {
+    /// The reason.
+    pub why: LeftAlone,
+    /// What exactly is in the way, if the arm could not have gone there.
+    pub detail: Option<String>,
+}
+
+impl From<LeftAlone> for Refused {
+    fn from(why: LeftAlone) -> Self {
+        Self { why, detail: None }
+    }
+}
+
+impl From<Refusal> for Refused {
+    fn from(refusal: Refusal) -> Self {
+        Self {
+            why: (&refusal).into(),
+            detail: Some(refusal.to_string()),
+        }
+    }
+}
+
+impl Refused {
+    /// Of what two arms say that which came nearer to a target; both where neither could have gone there.
+    fn or(self, other: Self) -> Self {
+        let nearness = |refused: &Self| match refused.why {
+            LeftAlone::HullOutside => 0,
+            LeftAlone::HullEdge => 1,
+            _ => 2,
+        };
+        match (nearness(&self).cmp(&nearness(&other)), &self.detail, &other.detail) {
+            (std::cmp::Ordering::Less, ..) => other,
+            (std::cmp::Ordering::Equal, Some(a), Some(b)) => Self {
+                detail: Some(format!("{a}; {b}")),
+                ..self
+            },
+            _ => self,
+        }
+    }
 }
 
 /// True if the picture alone rather says that it is no screw: only the odds of a stuck cover speak for it.
@@ -224,6 +293,7 @@ fn judge(
         hull: mapped.map(|m| m.hull),
         tilt_rad: leaning(sheet, head_normal(screw)),
         left_alone: None,
+        refusal: None,
     };
     let place = target(screw, &found, shot, sheet, face, arms, config);
     match place {
@@ -235,8 +305,9 @@ fn judge(
             }
             (found, Some(place))
         }
-        Err(reason) => {
-            found.left_alone = Some(reason);
+        Err(refused) => {
+            found.left_alone = Some(refused.why);
+            found.refusal = refused.detail;
             (found, None)
         }
     }
@@ -250,30 +321,28 @@ fn target(
     face: Option<&FaceFit>,
     arms: &[Reach<'_>],
     config: &CellConfig,
-) -> Result<SafeTarget, LeftAlone> {
+) -> Result<SafeTarget, Refused> {
     match screw.verdict {
         Verdict::Screw => {}
-        Verdict::Other => return Err(LeftAlone::OtherDrive),
-        Verdict::Review => return Err(LeftAlone::Review),
+        Verdict::Other => return Err(LeftAlone::OtherDrive.into()),
+        Verdict::Review => return Err(LeftAlone::Review.into()),
     }
     let point = screw.camera.ok_or(LeftAlone::NoDepth)?;
     if !is_head_size(screw.diameter_px, point, shot, config) {
-        return Err(LeftAlone::HeadSize);
+        return Err(LeftAlone::HeadSize.into());
     }
     if found
         .tilt_rad
         .is_some_and(|tilt| tilt > config.exclusion.screw_tilt_max_rad)
     {
-        return Err(LeftAlone::Bent);
+        return Err(LeftAlone::Bent.into());
     }
     let normal = line_of_approach(sheet, head_normal(screw), face, config).ok_or(LeftAlone::NoDepth)?;
-    let mut refused = LeftAlone::HullOutside;
+    let mut refused = Refused::from(LeftAlone::HullOutside);
     for reach in arms {
-        match SafeTarget::locate(reach.map, reach.arm, point, normal, config.approach.standoff_mm) {
+        match SafeTarget::locate(reach, point, normal, &config.approach) {
             Ok(place) => return Ok(place),
-            // of several refusals the mildest says most
-            Err(LeftAlone::HullEdge) => refused = LeftAlone::HullEdge,
-            Err(_) => {}
+            Err(why) => refused = refused.or(why),
         }
     }
     Err(refused)

@@ -43,6 +43,9 @@ pub struct Found {
     pub tilt_rad: Option<f64>,
     /// Why it is not acted on; `None` for a target.
     pub left_alone: Option<LeftAlone>,
+    /// What exactly is in the way, where an arm could not have gone there.
+    #[serde(default)]
+    pub refusal: Option<String>,
 }
 
 /// Why a candidate is not acted on.
@@ -63,6 +66,10 @@ pub enum LeftAlone {
     HeadSize,
     /// The sheet around it is bent beyond the driver's range.
     Bent,
+    /// No arm's joints can take it there, or not clear of the wrist's singularity.
+    Unreachable,
+    /// On the way there an arm would come too near to something.
+    Collision,
 }
 
 impl fmt::Display for LeftAlone {
@@ -75,6 +82,8 @@ impl fmt::Display for LeftAlone {
             Self::HullOutside => "outside the calibrated volume",
             Self::HeadSize => "not the size of a screw's head",
             Self::Bent => "the sheet is bent beyond the driver's range",
+            Self::Unreachable => "out of the arms' reach",
+            Self::Collision => "something is in an arm's way",
         })
     }
 }

@@ -4,6 +4,7 @@ use crate::config::{Approach, Drive, Timeouts};
 use crate::device::{
     Arm, ArmState, Clock, DeviceError, DriveEnd, DriveProgram, DriverTool, Motion, RobotArm, Ticket, jobs,
 };
+use crate::motion::{ArmMotion, Leg, Refusal};
 use crate::plan::{SafeTarget, tool_pose};
 use crate::record::Burst;
 use geometry::{Base, Direction, Point, Tool, Transform};
@@ -47,6 +48,8 @@ pub struct Mover<'a> {
     pub timeouts: Timeouts,
     /// The cell's clock.
     pub clock: &'a Arc<dyn Clock>,
+    /// What is around it; without, it is sent to no screw.
+    pub motion: Option<&'a ArmMotion>,
 }
 
 impl std::fmt::Debug for Mover<'_> {
@@ -115,13 +118,36 @@ impl Mover<'_> {
                 reason: "it carries no driver".into(),
             });
         };
-        self.ready().await?;
-        self.to_standoff(target, Motion::Joint).await?;
+        let state = self.ready().await?;
+        for pose in self.way(state.joints_rad, target).await? {
+            self.go(pose, Motion::Joint).await?;
+        }
         let worked = self.work(driver, target, program, burst).await;
         let back = Motion::Linear {
             speed_mm_s: self.approach.retract_mm_s,
         };
         worked.and(self.to_standoff(target, back).await)
+    }
+
+    /// Poses on the way to in front of a target, itself the last. Where no way is free from where the arm stands, it goes home first:
+    /// from there the target was planned.
+    async fn way(&self, joints_rad: [f64; 6], target: &SafeTarget) -> Result<Vec<Transform<Base, Tool>>, DeviceError> {
+        let refused = |reason: String| DeviceError::Refused {
+            device: self.robot().name().into(),
+            reason,
+        };
+        let motion = self
+            .motion
+            .ok_or_else(|| refused("what is around it is not drawn".into()))?;
+        let way = match target.check(motion, joints_rad, &self.approach) {
+            Err(Refusal::Collision { leg: Leg::Joint, .. }) => {
+                self.home().await?;
+                target.check(motion, self.ready().await?.joints_rad, &self.approach)
+            }
+            checked => checked,
+        };
+        way.map(|way| way.joint.iter().map(|leg| leg.to).collect())
+            .map_err(|why| refused(why.to_string()))
     }
 
     /// From in front of the screw: in, and drive.
@@ -159,7 +185,7 @@ impl Mover<'_> {
         self.go(tool_pose(tip, approach), Motion::Joint).await
     }
 
-    /// The only place that sends a move. Private: poses come from [`SafeTarget`]s and calibration plans alone.
+    /// The only place that sends a move. Private: poses come from [`SafeTarget`]s, from ways to them and from calibration plans alone.
     async fn go(&self, pose: Transform<Base, Tool>, motion: Motion) -> Result<(), DeviceError> {
         match self.robot().move_to(pose, motion).await {
             Ok(ticket) => self.arrive(ticket, Some(pose)).await,
@@ -181,11 +207,17 @@ impl Mover<'_> {
         }
     }
 
-    /// Sends the arm out of the way of table and camera.
+    /// Sends the arm out of the way of table and camera, by way of a place farther back where straight home is not free.
     ///
     /// # Errors
     /// As for [`job`](Self::job).
     pub async fn home(&self) -> Result<(), DeviceError> {
+        if let Some(motion) = self.motion {
+            let joints_rad = self.robot().state().await?.joints_rad;
+            if let Some(via) = motion.via_home(joints_rad) {
+                self.go(via, Motion::Joint).await?;
+            }
+        }
         self.job(jobs::HOME).await
     }
 

@@ -7,6 +7,7 @@ use crate::capture::{FaceFit, Shot, present, region_around, regions_around, shee
 use crate::config::CellConfig;
 use crate::device::{DeviceError, Devices, DriveEnd, DriveProgram, TagValue, jobs, tags};
 use crate::journal::{Journal, JournalError};
+use crate::motion::ArmMotion;
 use crate::plan::{self, Reach, SafeTarget, Target};
 use crate::program::{FaceId, Program, Step, Work};
 use crate::record::{
@@ -120,6 +121,8 @@ pub struct Runner {
     devices: Devices,
     finder: Arc<dyn Finder>,
     maps: Vec<Map>,
+    /// One per arm; `None` for an arm that is not drawn.
+    motions: Vec<Option<ArmMotion>>,
     program: Program,
     config: CellConfig,
     journal: Journal,
@@ -140,7 +143,8 @@ impl Runner {
     /// * `maps` – one per arm, in the order of the arms; an arm without a map is never sent to a screw.
     ///
     /// # Errors
-    /// [`RunError::Setup`] if no arm can take screws out, or the program names an arm that is not there.
+    /// [`RunError::Setup`] if no arm can take screws out, one that could is not in the cell's drawing, or the program names an arm
+    /// that is not there.
     pub fn new(
         devices: Devices,
         finder: Arc<dyn Finder>,
@@ -154,6 +158,21 @@ impl Runner {
             return Err(RunError::Setup {
                 reason: "no arm has both a driver and a map; calibrate one first".into(),
             });
+        }
+        let motions: Vec<Option<ArmMotion>> = devices
+            .arms
+            .iter()
+            .map(|arm| ArmMotion::new(&config.motion, arm.robot.name()))
+            .collect();
+        for ((arm, _), motion) in devices.arms.iter().zip(&maps).zip(&motions) {
+            if arm.driver.is_some() && motion.is_none() {
+                return Err(RunError::Setup {
+                    reason: format!(
+                        "arm '{}' is not drawn, so that nothing says what it could run into; describe it in [[motion.arms]] of the cell file",
+                        arm.robot.name()
+                    ),
+                });
+            }
         }
         let names: Vec<&str> = devices.arms.iter().map(|arm| arm.robot.name()).collect();
         for step in &program.steps {
@@ -173,6 +192,7 @@ impl Runner {
             devices,
             finder,
             maps,
+            motions,
             program,
             config,
             journal,
@@ -298,6 +318,7 @@ impl Way<'_> {
             approach: runner.config.approach,
             timeouts: runner.config.timeouts,
             clock: &runner.devices.clock,
+            motion: runner.motions.get(arm).and_then(Option::as_ref),
         })
     }
 
@@ -489,7 +510,7 @@ impl Way<'_> {
         let before = self.record.faces.iter().rev().find(|f| f.face == *face);
         let before = before.map_or(&[][..], |f| &f.found);
         plan::bound_doubtful(&mut screws, odds, config.inspection.doubtful_max, before, fit.as_ref());
-        let (found, targets) = plan::plan(&screws, &shot, fit.as_ref(), &self.reaches(), &config);
+        let (found, targets) = plan::plan(&screws, &shot, fit.as_ref(), &self.reaches().await?, &config);
         let picture = self
             .runner
             .journal
@@ -550,12 +571,23 @@ impl Way<'_> {
         })
     }
 
-    fn reaches(&self) -> Vec<Reach<'_>> {
+    /// The arms that can take screws out, as they stand now.
+    async fn reaches(&self) -> Result<Vec<Reach<'_>>, DeviceError> {
         let runner = &self.runner;
-        let arms = runner.devices.arms.iter().zip(&runner.maps).enumerate();
-        arms.filter(|(_, (arm, _))| arm.driver.is_some())
-            .map(|(arm, (_, map))| Reach { arm, map })
-            .collect()
+        let mut reaches = Vec::new();
+        let arms = runner.devices.arms.iter().zip(&runner.maps).zip(&runner.motions);
+        for (arm, ((device, map), motion)) in arms.enumerate() {
+            if let (Some(_), Some(motion)) = (&device.driver, motion) {
+                let joints_rad = device.robot.state().await?.joints_rad;
+                reaches.push(Reach {
+                    arm,
+                    map,
+                    motion,
+                    joints_rad,
+                });
+            }
+        }
+        Ok(reaches)
     }
 
     /// How much likelier than pictures say a doubtful head is a screw: a cover that does not come off is evidence.
@@ -590,6 +622,10 @@ impl Way<'_> {
         let count = targets.len();
         for (number, target) in targets.iter().enumerate() {
             self.observer.screw(number, count);
+            // an arm comes to a face that no other one stands at
+            if number > 0 && targets[number - 1].place.arm() != target.place.arm() {
+                self.home().await?;
+            }
             self.remove(target, &shot).await?;
         }
         self.verify(&targets, &shot).await?;
@@ -735,7 +771,7 @@ impl Way<'_> {
         })?;
         let Some(screw) = closest else { return Ok(None) };
         // the region is too small for the plane of the face: the sheet around the screw has to do
-        let (_, again) = plan::plan(&[screw], &near, None, &self.reaches(), &config);
+        let (_, again) = plan::plan(&[screw], &near, None, &self.reaches().await?, &config);
         Ok(again.first().map(|t| (t.place, picture)))
     }
 
@@ -899,12 +935,15 @@ impl Way<'_> {
                 LeftAlone::HullOutside,
                 LeftAlone::NoDepth,
                 LeftAlone::Bent,
+                LeftAlone::Unreachable,
+                LeftAlone::Collision,
             ];
             let screw = last
                 .found
                 .iter()
                 .find(|f| f.verdict == Verdict::Screw && f.left_alone.is_some_and(|why| barred.contains(&why)));
-            if let Some(why) = screw.and_then(|f| f.left_alone) {
+            if let Some((screw, why)) = screw.and_then(|f| Some((f, f.left_alone?))) {
+                let why = screw.refusal.clone().unwrap_or_else(|| why.to_string());
                 return Some(Outcome::Ng {
                     reason: NgReason::ScrewOutOfReach,
                     detail: format!("{face}: a screw was left alone ({why}), its cover stays"),

@@ -2,13 +2,12 @@
 
 mod fake;
 
-use cell::config::CellConfig;
 use cell::device::DriveEnd;
 use cell::journal::Journal;
 use cell::program::Program;
 use cell::record::{Act, ExclusionReason, LeftAlone, NgReason, Outcome, PullEnd, Purpose, SeenBy, UnitRecord};
 use cell::run::{RunError, Runner, Silent};
-use fake::{Fake, base_from_camera, map, screw, screw_that_ends, volume};
+use fake::{Fake, base_from_camera, config, map, screw, screw_that_ends, volume};
 use geometry::Point;
 use std::path::Path;
 use std::sync::Arc;
@@ -24,7 +23,7 @@ fn runner_with(fake: &Fake, folder: &Path, program: Program, finder: impl cell::
         Arc::new(finder),
         vec![map()],
         program,
-        CellConfig::simulated(),
+        config(),
         journal,
     )
     .expect("runner")
@@ -199,6 +198,80 @@ fn screws_that_lean_together_exclude_a_few_do_not() {
             record.outcome
         );
     }
+}
+
+/// A pole of the cell that stands right before the first of two screws of the front.
+fn pole_before_a_screw() -> (Fake, cell::CellConfig) {
+    let fake = Fake::new(&[("front", vec![screw(-150.0, 0.0), screw(150.0, 50.0)])]);
+    let at = base_from_camera() * Point::new(-150.0, 0.0, 1500.0);
+    let mut config = config();
+    config.motion.obstacles.push(cell::motion::DrawnBox {
+        name: "pole".into(),
+        middle_mm: [at.x_mm() - 60.0, at.y_mm(), at.z_mm()],
+        size_mm: [30.0, 30.0, 900.0],
+    });
+    (fake, config)
+}
+
+#[test]
+fn a_screw_behind_something_is_left_alone_and_the_record_says_behind_what() {
+    let (fake, config) = pole_before_a_screw();
+    let folder = tempfile::tempdir().expect("folder");
+    let journal = Journal::open(folder.path()).expect("journal");
+    let program = Program::paper().expect("built-in program");
+    let finder = Arc::new(fake.clone());
+    let mut runner = Runner::new(fake.devices(), finder, vec![map()], program, config, journal).expect("runner");
+    let record = block_on(runner.run_unit(&Silent)).expect("a record");
+    let front = &record.faces[0];
+    assert_eq!(front.found[0].left_alone, Some(LeftAlone::Collision));
+    let why = front.found[0].refusal.clone().unwrap_or_default();
+    assert!(why.contains("arm_a") && why.contains("the pole"), "{why}");
+    assert_eq!((front.found[1].left_alone, &front.found[1].refusal), (None, &None));
+    // no arm was ever sent near it
+    let screw = base_from_camera() * Point::new(-150.0, 0.0, 1500.0);
+    let tips = fake.world().poses.clone();
+    let tips = tips.iter().map(|pose| *pose * Point::new(0.0, 0.0, 0.0));
+    assert!(tips.map(|tip| tip.distance_mm(screw)).all(|mm| mm > 100.0));
+    assert_eq!(front.attempts.iter().map(|a| a.found).collect::<Vec<_>>(), [1]);
+    // its cover stays, and that is why
+    let Some(Outcome::Ng { reason, detail }) = record.outcome else {
+        panic!("{:?}", record.outcome)
+    };
+    assert_eq!(reason, NgReason::ScrewOutOfReach);
+    assert!(detail.contains("the pole"), "{detail}");
+}
+
+#[test]
+fn what_one_arm_cannot_do_safely_the_other_does() {
+    let (fake, config) = pole_before_a_screw();
+    let folder = tempfile::tempdir().expect("folder");
+    let journal = Journal::open(folder.path()).expect("journal");
+    let program = Program::paper().expect("built-in program");
+    let mut devices = fake.devices();
+    devices.arms[1].driver = devices.arms[0].driver.clone();
+    let finder = Arc::new(fake.clone());
+    // both maps are the same: what the pole hides from one arm the other sees 700 mm beside it
+    let maps = vec![map(), map()];
+    let mut runner = Runner::new(devices, finder, maps, program, config, journal).expect("runner");
+    let record = block_on(runner.run_unit(&Silent)).expect("a record");
+    let front = &record.faces[0];
+    assert!(front.found.iter().all(|f| f.left_alone.is_none()), "{:?}", front.found);
+    let mut arms: Vec<(usize, &str)> = front.attempts.iter().map(|a| (a.found, a.arm.as_str())).collect();
+    arms.sort_unstable();
+    assert_eq!(arms, [(0, "arm_b"), (1, "arm_a")]);
+}
+
+#[test]
+fn an_arm_that_is_not_drawn_is_not_sent_to_screws() {
+    let (fake, mut config) = pole_before_a_screw();
+    config.motion.arms.remove(0);
+    let folder = tempfile::tempdir().expect("folder");
+    let journal = Journal::open(folder.path()).expect("journal");
+    let program = Program::paper().expect("built-in program");
+    let finder = Arc::new(fake.clone());
+    let refused = Runner::new(fake.devices(), finder, vec![map()], program, config, journal).expect_err("not drawn");
+    let text = refused.to_string();
+    assert!(text.contains("arm_a") && text.contains("[[motion.arms]]"), "{text}");
 }
 
 #[test]
@@ -535,7 +608,7 @@ fn a_program_for_an_arm_that_is_not_there_is_refused() {
         Arc::new(fake.clone()),
         vec![map()],
         Program::parse(&text, "p.toml").expect("parsed"),
-        CellConfig::simulated(),
+        config(),
         Journal::open(folder.path()).expect("journal"),
     );
     let error = built.expect_err("no such arm");

@@ -2,15 +2,17 @@
 
 use crate::draw::mix;
 use crate::faults::Fault;
-use crate::kinematics::{Gp25, HOME_RAD};
 use crate::mechanics::{ArmErrors, Body};
 use crate::world::{CoverJob, Shared, World, lock};
 use async_trait::async_trait;
 use cell::device::{ArmMode, ArmState, DeviceError, Motion, RobotArm, Ticket, jobs};
+use cell::motion::{Gp25, HOME_RAD, Trajectory};
 use geometry::{Base, Camera, Flange, Tool, Transform};
 
 /// Round trip to the controller, s.
 const ROUND_TRIP_S: f64 = 0.004;
+/// Time until the controller reports "in position" after the last motion, s.
+const SETTLE_S: f64 = 0.08;
 /// Time of gripping, loosening and pulling a cover, s.
 const PULL_S: f64 = 10.5;
 /// Time of laying a cover aside, s.
@@ -242,26 +244,19 @@ impl RobotArm for ArmHandle {
             .inverse(base_from_tool)
             .map_err(|e| self.refuse(e.to_string()))?;
         let from_rad = arm.joints_at(world.now_s());
-        let joint_s = Gp25::joint_time_s(from_rad, to_rad);
-        let takes_s = match motion {
-            Motion::Joint => joint_s,
+        let moving_s = match motion {
+            Motion::Joint => Gp25::travel_s(from_rad, to_rad),
             Motion::Linear { speed_mm_s } => {
                 if !(speed_mm_s.is_finite() && speed_mm_s > 0.0) {
                     return Err(self.refuse(format!("a speed of {speed_mm_s} mm/s is none")));
                 }
                 let from = arm.model.forward(from_rad);
-                let (a, b) = (from.isometry(), base_from_tool.isometry());
-                for step in 1..8 {
-                    let t = f64::from(step) / 8.0;
-                    let between = a.try_lerp_slerp(b, t, 1e-9).unwrap_or(*b);
-                    arm.model
-                        .inverse(Transform::from_isometry(between))
-                        .map_err(|e| self.refuse(format!("on the straight line: {e}")))?;
-                }
-                let distance_mm = (b.translation.vector - a.translation.vector).norm();
-                Gp25::linear_time_s(distance_mm, speed_mm_s).max(joint_s)
+                Trajectory::straight(&arm.model, from, base_from_tool, speed_mm_s)
+                    .map_err(|e| self.refuse(format!("on the straight line: {e}")))?
+                    .duration_s()
             }
         };
+        let takes_s = moving_s + SETTLE_S;
         if let Some(reason) = world.keep_out(self.index, base_from_tool) {
             return Err(self.refuse(reason));
         }
@@ -299,7 +294,7 @@ impl RobotArm for ArmHandle {
         let now_s = world.now_s();
         let arm = &world.arms[self.index];
         arm.ready()?;
-        let home_s = Gp25::joint_time_s(arm.joints_at(now_s), HOME_RAD);
+        let home_s = Gp25::travel_s(arm.joints_at(now_s), HOME_RAD) + SETTLE_S;
         let (takes_s, work) = if job == jobs::HOME {
             (home_s, None)
         } else if arm.gripper && job == jobs::DROP {

@@ -122,3 +122,71 @@ pub(crate) fn station(
         tilt * UnitQuaternion::from_axis_angle(&Vector3::z_axis(), turn),
     )
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use cell::motion::{ArmMotion, CellDrawing, Gp25, HOME_RAD};
+
+    fn arm() -> Gp25 {
+        Gp25::new(flange_from_tool())
+    }
+
+    /// Places of the paper's lattice in an arm's base, and 40 mm before each: from there the bit goes in.
+    fn lattice(arm: usize) -> impl Iterator<Item = (Point<Base>, Point<Base>)> {
+        let low = volume(arm)[0];
+        let nodes = (0..9).flat_map(|i| (0..19).flat_map(move |j| (0..16).map(move |k| [i, j, k])));
+        nodes.map(move |node| {
+            let [x, y, z] = node.map(|n| 50.0 * f64::from(n));
+            let at = |back_mm: f64| Point::new(low.x_mm() + x - back_mm, low.y_mm() + y, low.z_mm() + z);
+            (at(40.0), at(0.0))
+        })
+    }
+
+    #[test]
+    fn both_arms_reach_the_whole_lattice_clear_of_the_singularity() {
+        for index in 0..2 {
+            for at in lattice(index).flat_map(|(before, at)| [before, at]) {
+                let q = arm().inverse(tool_at(at));
+                let q = q.unwrap_or_else(|e| panic!("arm {index} at {at:?}: {e}"));
+                let reached = arm().forward(q) * Point::new(0.0, 0.0, 0.0);
+                assert!(reached.distance_mm(at) < 1e-3);
+                assert!(q[4] > 0.5, "J5 at {} rad is near its singularity at {at:?}", q[4]);
+            }
+        }
+    }
+
+    #[test]
+    fn the_cell_s_drawing_is_this_layout() {
+        let drawing = CellDrawing::default();
+        for (index, (name, foot_mm)) in ARMS.into_iter().enumerate() {
+            let motion = ArmMotion::new(&drawing, name).expect("a drawn arm");
+            assert_eq!(motion.arm().flange_from_tool(), flange_from_tool());
+            assert_eq!((motion.home_rad(), drawing.arms[index].foot_mm), (HOME_RAD, foot_mm));
+        }
+        let camera = drawing
+            .obstacles
+            .iter()
+            .find(|block| block.name == "camera")
+            .expect("drawn");
+        let inside = |axis: usize| (CAMERA_MM[axis] - camera.middle_mm[axis]).abs() < 0.5 * camera.size_mm[axis];
+        assert!((0..3).all(inside), "{camera:?}");
+        let middle = |axis: usize| 0.5 * (VOLUME_MM[0][axis] + VOLUME_MM[1][axis]);
+        assert_eq!(drawing.unit.middle_mm[1..], [middle(1), middle(2)]);
+    }
+
+    #[test]
+    fn one_configuration_everywhere() {
+        let [low, high] = volume(0);
+        let mut last: Option<[f64; 6]> = None;
+        for step in 0..=200 {
+            let t = f64::from(step) / 200.0;
+            let at = Point::from_vector(low.vector() + (high.vector() - low.vector()) * t);
+            let q = arm().inverse(tool_at(at)).expect("in reach");
+            if let Some(before) = last {
+                assert!((0..6).all(|j| (q[j] - before[j]).abs() < 0.1), "a jump at {at:?}");
+            }
+            last = Some(q);
+        }
+    }
+}

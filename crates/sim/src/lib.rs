@@ -20,7 +20,6 @@ mod draw;
 mod driver;
 mod faults;
 mod io;
-pub mod kinematics;
 pub mod layout;
 mod log;
 mod mechanics;

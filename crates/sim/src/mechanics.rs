@@ -1,7 +1,7 @@
 //! Where the tool of an arm really is: what the controller does not know of its own arm.
 
 use crate::draw::{draw, normal, signed};
-use crate::kinematics::{Links, chain, model_angles};
+use cell::motion::{A2_MM, C2_MM, C3_MM, Links, model_angles};
 use geometry::{Base, Flange, Tool, Transform};
 use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
 use rand::RngExt;
@@ -131,7 +131,7 @@ impl Body {
         model[1] += sag[0];
         model[2] += sag[1];
         model[4] += sag[2];
-        let mut pose = Transform::<Base, Flange>::from_isometry(chain(model, &self.links)) * self.flange_from_bit;
+        let mut pose = self.links.flange(model) * self.flange_from_bit;
         if jig {
             pose = pose * Transform::<Tool, Tool>::from_parts(self.jig_offset_mm, UnitQuaternion::identity());
         }
@@ -142,7 +142,6 @@ impl Body {
 
     /// How far gravity turns J2, J3 and J5, rad: weights times levers over the gears' stiffness. Positive angles lean forward.
     fn sag_rad(&self, model: [f64; 6]) -> [f64; 3] {
-        use crate::kinematics::{A2_MM, C2_MM, C3_MM};
         let (upper, fore) = (model[1], model[1] + model[2]);
         // Horizontal distances in the plane of the arm, mm.
         let elbow = C2_MM * upper.sin();
@@ -160,8 +159,8 @@ impl Body {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::kinematics::Gp25;
     use crate::layout;
+    use cell::motion::Gp25;
     use geometry::Point;
 
     const TIP: Point<Tool> = Point::new(0.0, 0.0, 0.0);

@@ -543,3 +543,51 @@ fn score_of(loaded: &LoadedUnit) -> UnitScore {
 pub fn unit_seed(units_seed: u64, index: u64) -> u64 {
     mix(units_seed, &[50, index])
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use cell::motion::{ArmMotion, CellDrawing, HOME_RAD};
+    use geometry::Direction;
+
+    #[test]
+    fn an_arm_can_go_to_every_screw_of_every_unit() {
+        let drawing = CellDrawing::default();
+        let motions = layout::ARMS.map(|(name, _)| ArmMotion::new(&drawing, name).expect("a drawn arm"));
+        let mut world = World::new(SimSettings::default());
+        let (mut screws, mut by_second, mut around) = (0, 0, 0);
+        for _ in 0..60 {
+            world.load();
+            let loaded = world.unit.as_ref().expect("a unit");
+            for design in &loaded.unit.faces {
+                let camera_from_face = world.camera_from_face(loaded, design.id).expect("a face");
+                for screw in &design.screws {
+                    let [x, y] = screw.placed.at_mm;
+                    let ways: Vec<_> = motions
+                        .iter()
+                        .zip(&world.arms)
+                        .map(|(motion, arm)| {
+                            let base_from_face = arm.base_from_camera * camera_from_face;
+                            let tip = base_from_face * Point::new(x, y, -screw.placed.height_mm);
+                            let inwards = base_from_face * Direction::new(0.0, 0.0, 1.0).expect("a direction");
+                            let standoff = cell::plan::tool_pose(tip.moved(inwards, -40.0), inwards);
+                            motion.check(HOME_RAD, standoff, cell::plan::tool_pose(tip, inwards), 150.0)
+                        })
+                        .collect();
+                    screws += 1;
+                    match (&ways[0], &ways[1]) {
+                        (Ok(way), _) => around += usize::from(way.via().is_some()),
+                        (Err(_), Ok(_)) => by_second += 1,
+                        (Err(a), Err(b)) => {
+                            panic!("{:?} ({x}, {y}) of {:?} mm: {a}; {b}", design.id, loaded.unit.size_mm)
+                        }
+                    }
+                }
+            }
+        }
+        // the lowest of tall units that lean are for the other arm
+        assert!(screws > 1000 && by_second * 50 < screws, "{by_second} of {screws}");
+        // from a rest above the table most joint moves would swing the bit through the unit
+        assert!(around * 2 > screws, "{around} of {screws}");
+    }
+}

@@ -10,9 +10,9 @@ const LEFT: f64 = 110.0;
 /// Width of the chart, px.
 const WIDTH: f64 = 1220.0;
 /// Height of a lane, px.
-const LANE: f64 = 46.0;
+const LANE: f64 = 54.0;
 /// Height of a bar, px.
-const BAR: f64 = 32.0;
+const BAR: f64 = 28.0;
 /// Above the lanes, px.
 const TOP: f64 = 26.0;
 
@@ -28,7 +28,10 @@ const COLOURS: [(&str, &str); 8] = [
 ];
 
 fn colour(name: &str) -> &'static str {
-    COLOURS.iter().find(|(n, _)| *n == name).map_or("#999", |(_, colour)| colour)
+    COLOURS
+        .iter()
+        .find(|(n, _)| *n == name)
+        .map_or("#999", |(_, colour)| colour)
 }
 
 /// The page.
@@ -80,7 +83,13 @@ impl<'a> Chart<'a> {
     /// Lanes: table and camera by table, then the arms.
     fn lanes(&self) -> Vec<String> {
         let tables = self.problem.station.tables_y_mm.len();
-        let number = |k: usize| if tables > 1 { format!(" {}", k + 1) } else { String::new() };
+        let number = |k: usize| {
+            if tables > 1 {
+                format!(" {}", k + 1)
+            } else {
+                String::new()
+            }
+        };
         let stands = (0..tables).flat_map(|k| [format!("table{}", number(k)), format!("camera{}", number(k))]);
         let arms = self.problem.station.arms.iter().map(|arm| arm.name.replace('_', " "));
         stands.chain(arms).collect()
@@ -109,7 +118,7 @@ fill=\"{colour}\" stroke=\"#fff\" stroke-width=\"0.6\"/></g>",
 
     /// A label inside a bar, if it fits.
     fn label(&mut self, lane: usize, x: f64, room: f64, down: f64, label: &str) -> Result<()> {
-        if label.is_empty() || 6.0 * label.chars().count() as f64 > room {
+        if label.is_empty() || 5.6 * label.chars().count() as f64 > room {
             return Ok(());
         }
         let y = TOP + LANE * (lane as f64 + 0.5) + down;
@@ -137,11 +146,22 @@ fill=\"{colour}\" stroke=\"#fff\" stroke-width=\"0.6\"/></g>",
             Kind::Look | Kind::SecondLook => {
                 self.bar(table + 1, [begin_s, end_s], colour("picture"), "", &task.name)?;
                 let title = format!("{}: from picture to places", task.name);
-                self.bar(table + 1, [end_s, end_s + times.process], colour("processing"), "", &title)?;
+                self.bar(
+                    table + 1,
+                    [end_s, end_s + times.process],
+                    colour("processing"),
+                    "",
+                    &title,
+                )?;
             }
             Kind::Screws => {
                 let face = &problem.product.faces[task.part].name;
-                for (arm, used) in mode.arms.iter().enumerate().filter_map(|(a, u)| u.as_ref().map(|u| (a, u))) {
+                for (arm, used) in mode
+                    .arms
+                    .iter()
+                    .enumerate()
+                    .filter_map(|(a, u)| u.as_ref().map(|u| (a, u)))
+                {
                     let lane = self.arm_lane(arm);
                     let stops: Vec<_> = mode.stops.iter().filter(|stop| stop.arm == arm).collect();
                     let wait_s = stops.first().map_or(0.0, |stop| (stop.start_s - 1.0).max(0.0));
@@ -152,30 +172,37 @@ fill=\"{colour}\" stroke=\"#fff\" stroke-width=\"0.6\"/></g>",
                         let span_s = [begin_s + stop.start_s, begin_s + stop.end_s];
                         self.bar(lane, span_s, colour("screw driven"), "", &title)?;
                     }
-                    // on white over the bars, so that it can be read
                     let label = format!("{} ({})", face.replace('_', " "), stops.len());
                     let middle = LEFT + 0.5 * (span_s[0] + span_s[1]) * self.px_s;
-                    let half = 3.2 * label.len() as f64 + 4.0;
-                    if 2.0 * half < (span_s[1] - span_s[0]) * self.px_s + 8.0 {
-                        let y = TOP + LANE * (lane as f64 + 0.5) - 8.0;
-                        write!(
-                            self.bars,
-                            "<rect x=\"{:.1}\" y=\"{y:.1}\" width=\"{:.1}\" height=\"16\" rx=\"3\" fill=\"#fff\" opacity=\"0.92\" pointer-events=\"none\"/>",
-                            middle - half,
-                            2.0 * half
-                        )?;
-                        self.label(lane, middle, f64::INFINITY, 4.0, &label)?;
-                    }
+                    let room = (span_s[1] - span_s[0]) * self.px_s;
+                    self.label(lane, middle, room + 24.0, 0.5 * BAR + 11.0, &label)?;
                 }
             }
             Kind::Cover => {
                 let cover = problem.product.covers[task.part].name.replace('_', " ");
-                for (arm, used) in mode.arms.iter().enumerate().filter_map(|(a, u)| u.as_ref().map(|u| (a, u))) {
+                for (arm, used) in mode
+                    .arms
+                    .iter()
+                    .enumerate()
+                    .filter_map(|(a, u)| u.as_ref().map(|u| (a, u)))
+                {
                     let lane = self.arm_lane(arm);
                     let pulled = [begin_s, end_s];
-                    self.bar(lane, pulled, colour("cover pulled"), &format!("{cover} cover"), &task.name)?;
+                    self.bar(
+                        lane,
+                        pulled,
+                        colour("cover pulled"),
+                        &format!("{cover} cover"),
+                        &task.name,
+                    )?;
                     let aside = [end_s, begin_s + used.busy_s];
-                    self.bar(lane, aside, colour("cover laid aside"), "", &format!("{cover} cover laid aside"))?;
+                    self.bar(
+                        lane,
+                        aside,
+                        colour("cover laid aside"),
+                        "",
+                        &format!("{cover} cover laid aside"),
+                    )?;
                 }
             }
         }
@@ -213,7 +240,13 @@ fill=\"{colour}\" stroke=\"#fff\" stroke-width=\"0.6\"/></g>",
                     shown_s = free_s + turn_s;
                 }
                 let name = format!("{} to the camera", problem.sides[next]);
-                self.bar(lane, [shown_s.min(begin_s), until_s], "#f4f6f8", &problem.sides[next], &name)?;
+                self.bar(
+                    lane,
+                    [shown_s.min(begin_s), until_s],
+                    "#f4f6f8",
+                    &problem.sides[next],
+                    &name,
+                )?;
                 (side, free_s) = (next, until_s);
             }
         }
@@ -260,5 +293,8 @@ fill=\"{colour}\" stroke=\"#fff\" stroke-width=\"0.6\"/></g>",
 }
 
 fn escape(text: &str) -> String {
-    text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
+    text.replace('&', "&amp;")
+        .replace('<', "&lt;")
+        .replace('>', "&gt;")
+        .replace('"', "&quot;")
 }

@@ -376,9 +376,10 @@ fn tip(face: &FaceRecord, index: usize, found: &Found) -> String {
 /// What became of a find, in words.
 fn result(face: &FaceRecord, index: usize, found: &Found) -> String {
     let Some(attempt) = attempt(face, index) else {
-        return match &found.left_alone {
-            Some(why) => format!("left alone: {why}"),
-            None => "not reached in this step".into(),
+        return match (&found.left_alone, &found.refusal) {
+            (Some(why), Some(detail)) => format!("left alone: {why} ({detail})"),
+            (Some(why), None) => format!("left alone: {why}"),
+            (None, _) => "not reached in this step".into(),
         };
     };
     let end = match attempt.end() {

@@ -194,7 +194,11 @@ impl Dispatcher {
             }
             let until = |after: &super::After| {
                 let is_look = matches!(problem.tasks[after.task].kind, Kind::Look | Kind::SecondLook);
-                let until = if is_look && after.lag_s > 0.0 { Until::Known } else { Until::TableFree };
+                let until = if is_look && after.lag_s > 0.0 {
+                    Until::Known
+                } else {
+                    Until::TableFree
+                };
                 (after.task, until)
             };
             let needs_same = |q: &Placed| {
@@ -202,17 +206,30 @@ impl Dispatcher {
                 let other_mode = &other.modes[q.mode];
                 let turned = task.side.is_some() && other.side.is_some() && task.side != other.side;
                 let at_table = task.unit == other.unit && (task.alone || other.alone || turned);
-                at_table || mode.arms.iter().zip(&other_mode.arms).any(|(a, b)| a.is_some() && b.is_some())
+                at_table
+                    || mode
+                        .arms
+                        .iter()
+                        .zip(&other_mode.arms)
+                        .any(|(a, b)| a.is_some() && b.is_some())
             };
             let middle_mm = station.tables_y_mm[task.table];
-            let pull = mode.arms.iter().position(Option::is_some).filter(|_| task.kind == Kind::Cover);
+            let pull = mode
+                .arms
+                .iter()
+                .position(Option::is_some)
+                .filter(|_| task.kind == Kind::Cover);
             tasks[p.task] = Some(Fixed {
                 kind: task.kind,
                 unit: task.unit,
                 table: task.table,
                 side: task.side,
                 after: task.after.iter().map(until).collect(),
-                after_any: task.after_any.iter().map(|way| way.iter().map(until).collect()).collect(),
+                after_any: task
+                    .after_any
+                    .iter()
+                    .map(|way| way.iter().map(until).collect())
+                    .collect(),
                 rivals: placed
                     .iter()
                     .enumerate()
@@ -230,13 +247,21 @@ impl Dispatcher {
                 .collect(),
                 pull: pull.map(|arm| {
                     let half_mm = 0.5 * problem.product.covers[task.part].width_mm;
-                    (arm, (middle_mm - half_mm).floor() as i64, (middle_mm + half_mm).ceil() as i64)
+                    (
+                        arm,
+                        (middle_mm - half_mm).floor() as i64,
+                        (middle_mm + half_mm).ceil() as i64,
+                    )
                 }),
             });
         }
         let half_mm = 0.5 * station.clearance_mm;
         let (low_mm, high_mm) = (low_mm - half_mm - ZONE_MM, high_mm + half_mm + ZONE_MM);
-        let zones = if low_mm < high_mm { ((high_mm - low_mm) / ZONE_MM).ceil() as usize + 1 } else { 1 };
+        let zones = if low_mm < high_mm {
+            ((high_mm - low_mm) / ZONE_MM).ceil() as usize + 1
+        } else {
+            1
+        };
         let tasks: Vec<Fixed> = tasks.into_iter().flatten().collect();
         Self {
             progress: vec![Progress::default(); tasks.len()],
@@ -297,7 +322,11 @@ impl Dispatcher {
 
     /// Tasks that were dropped, by number.
     pub fn dropped(&self) -> impl Iterator<Item = usize> {
-        self.progress.iter().enumerate().filter(|(_, p)| p.dropped).map(|(k, _)| k)
+        self.progress
+            .iter()
+            .enumerate()
+            .filter(|(_, p)| p.dropped)
+            .map(|(k, _)| k)
     }
 
     /// Takes note of what ended; returns what follows at once.
@@ -321,7 +350,12 @@ impl Dispatcher {
                 self.over(Some(task), false);
             }
             Work::Process { task } => self.over(Some(task), is_done),
-            Work::Drive { task, arm, screw, attempt } => {
+            Work::Drive {
+                task,
+                arm,
+                screw,
+                attempt,
+            } => {
                 self.arms[arm].busy = false;
                 if !is_done {
                     if attempt < self.retries {
@@ -397,7 +431,10 @@ impl Dispatcher {
         } else {
             zone(low_mm - self.half_clearance_mm)..=self.zones.len() - 1
         };
-        if self.zones[range.clone()].iter().any(|held| held.is_some_and(|by| by != arm)) {
+        if self.zones[range.clone()]
+            .iter()
+            .any(|held| held.is_some_and(|by| by != arm))
+        {
             return false;
         }
         self.free(arm);
@@ -445,7 +482,15 @@ impl Dispatcher {
                 self.arms[arm].left.pop_front();
                 self.arms[arm].at_mm = Some(to_mm);
                 self.arms[arm].busy = true;
-                self.begin(Work::Drive { task, arm, screw, attempt }, commands);
+                self.begin(
+                    Work::Drive {
+                        task,
+                        arm,
+                        screw,
+                        attempt,
+                    },
+                    commands,
+                );
                 return true;
             }
         }
@@ -477,14 +522,19 @@ impl Dispatcher {
         let fixed = &self.tasks[task];
         let is_hopeless = match fixed.kind {
             // a unit that was loaded is taken away, whatever happened to it; a table whose unit stayed on it takes no other
-            Kind::Discharge => self.find(Kind::Load, fixed.unit).is_some_and(|load| self.is_lost((load, Until::Known))),
+            Kind::Discharge => self
+                .find(Kind::Load, fixed.unit)
+                .is_some_and(|load| self.is_lost((load, Until::Known))),
             // a face is looked at again even if a screw stayed: the picture is the record
             Kind::SecondLook => fixed.after.iter().any(|(before, _)| self.progress[*before].dropped),
             _ => {
                 let any = &fixed.after_any;
                 fixed.after.iter().any(|a| self.is_lost(*a))
                     || fixed.after.iter().any(|a| self.has_screws_in(a.0))
-                    || (!any.is_empty() && any.iter().all(|way| way.iter().any(|a| self.is_lost(*a) || self.has_screws_in(a.0))))
+                    || (!any.is_empty()
+                        && any
+                            .iter()
+                            .all(|way| way.iter().any(|a| self.is_lost(*a) || self.has_screws_in(a.0))))
             }
         };
         if is_hopeless {
@@ -496,13 +546,18 @@ impl Dispatcher {
     /// True for a second look at a face with a screw that is known to be in.
     fn has_screws_in(&self, task: usize) -> bool {
         let fixed = &self.tasks[task];
-        fixed.kind == Kind::SecondLook && fixed.after.iter().any(|(screws, _)| self.is_lost((*screws, Until::Known)))
+        fixed.kind == Kind::SecondLook
+            && fixed
+                .after
+                .iter()
+                .any(|(screws, _)| self.is_lost((*screws, Until::Known)))
     }
 
     /// True for a task that was planned after an alternative which is lost: others need not wait for it, as it may wait for them.
     fn is_put_back(&self, task: usize) -> bool {
         let any = &self.tasks[task].after_any;
-        any.iter().any(|way| way.iter().any(|a| self.is_lost(*a) || self.has_screws_in(a.0)))
+        any.iter()
+            .any(|way| way.iter().any(|a| self.is_lost(*a) || self.has_screws_in(a.0)))
     }
 
     fn begin_task(&mut self, task: usize, commands: &mut Vec<Command>) -> bool {
@@ -515,7 +570,10 @@ impl Dispatcher {
             p.dropped || p.table_free || (!p.begun && (!is_before || self.is_put_back(rival)))
         };
         let any = fixed.after_any.is_empty()
-            || fixed.after_any.iter().any(|way| way.iter().all(|a| self.has_come(*a) && !self.is_lost(*a)));
+            || fixed
+                .after_any
+                .iter()
+                .any(|way| way.iter().all(|a| self.has_come(*a) && !self.is_lost(*a)));
         if !(fixed.after.iter().all(ready) && fixed.rivals.iter().all(in_turn) && any) {
             return false;
         }
@@ -545,7 +603,9 @@ impl Dispatcher {
                 }
             }
             Kind::Cover => {
-                let Some((arm, low_mm, high_mm)) = fixed.pull else { return false };
+                let Some((arm, low_mm, high_mm)) = fixed.pull else {
+                    return false;
+                };
                 let rest_mm = self.rest_mm[arm];
                 if self.arms[arm].task.is_some() || !self.take(arm, low_mm.min(rest_mm), high_mm.max(rest_mm)) {
                     return false;
@@ -621,7 +681,13 @@ mod tests {
             let under_way: Vec<usize> = self.dispatcher.open.values().filter_map(arm_of).collect();
             for (arm, sweep) in self.sweeps_mm.iter_mut().enumerate() {
                 let at_rest = !under_way.contains(&arm) && self.dispatcher.arms[arm].at_mm.is_none();
-                if at_rest || self.dispatcher.open.values().any(|w| matches!(w, Work::LayAside { arm: a, .. } if *a == arm)) {
+                if at_rest
+                    || self
+                        .dispatcher
+                        .open
+                        .values()
+                        .any(|w| matches!(w, Work::LayAside { arm: a, .. } if *a == arm))
+                {
                     *sweep = None;
                 }
             }
@@ -657,7 +723,9 @@ mod tests {
 
     fn arm_of(work: &Work) -> Option<usize> {
         match work {
-            Work::Drive { arm, .. } | Work::Withdraw { arm } | Work::Pull { arm, .. } | Work::LayAside { arm, .. } => Some(*arm),
+            Work::Drive { arm, .. } | Work::Withdraw { arm } | Work::Pull { arm, .. } | Work::LayAside { arm, .. } => {
+                Some(*arm)
+            }
             _ => None,
         }
     }
@@ -752,7 +820,14 @@ mod tests {
     fn a_screw_that_stays_keeps_its_covers() {
         let product = Product::outdoor_unit().expect("built-in");
         let problem = Problem::new(&product, &Station::new(2, 1).expect("station"), 1).expect("problem");
-        let plan = solve(&problem, &Limits { rounds: 2, ..Limits::default() }, |_| {});
+        let plan = solve(
+            &problem,
+            &Limits {
+                rounds: 2,
+                ..Limits::default()
+            },
+            |_| {},
+        );
         let run = |stuck: Option<(usize, usize)>| {
             let mut dispatcher = Dispatcher::new(&problem, &plan.placed, 2);
             let mut commands: VecDeque<Command> = dispatcher.step(Event::Begin).into();
@@ -760,7 +835,11 @@ mod tests {
             while let Some(command) = commands.pop_front() {
                 let fails = matches!(command.work, Work::Drive { task, screw, .. } if stuck == Some((task, screw)));
                 count += usize::from(fails);
-                let event = if fails { Event::Failed(command.ticket) } else { Event::Done(command.ticket) };
+                let event = if fails {
+                    Event::Failed(command.ticket)
+                } else {
+                    Event::Done(command.ticket)
+                };
                 commands.extend(dispatcher.step(event));
             }
             assert!(dispatcher.is_finished());
@@ -768,12 +847,19 @@ mod tests {
         };
         let (all, _) = run(None);
         assert_eq!(all.dropped().count(), 0);
-        let right = problem.tasks.iter().position(|t| t.name == "1 right screws").expect("task");
+        let right = problem
+            .tasks
+            .iter()
+            .position(|t| t.name == "1 right screws")
+            .expect("task");
         let (stuck, attempts) = run(Some((right, 3)));
         assert_eq!(attempts, 3);
         assert_eq!(stuck.left_in(), [(right, 3)]);
         let dropped: Vec<&str> = stuck.dropped().map(|k| problem.tasks[k].name.as_str()).collect();
-        assert!(dropped.contains(&"1 top cover") && dropped.contains(&"1 right cover"), "{dropped:?}");
+        assert!(
+            dropped.contains(&"1 top cover") && dropped.contains(&"1 right cover"),
+            "{dropped:?}"
+        );
         assert!(!dropped.contains(&"1 discharge"), "{dropped:?}");
     }
 }

@@ -190,7 +190,9 @@ impl Product {
     /// # Errors
     /// [`ProductError::Syntax`] with line and key, [`ProductError::Value`] for names that do not exist and numbers that mean nothing.
     pub fn parse(text: &str, origin: &str) -> Result<Self, ProductError> {
-        let is_json = Path::new(origin).extension().is_some_and(|e| e.eq_ignore_ascii_case("json"));
+        let is_json = Path::new(origin)
+            .extension()
+            .is_some_and(|e| e.eq_ignore_ascii_case("json"));
         let product: Result<Self, String> = if is_json {
             serde_json::from_str(text).map_err(|e| e.to_string())
         } else {
@@ -233,7 +235,10 @@ impl Product {
             }
         }
         if self.faces.is_empty() && self.covers.is_empty() {
-            return Err(("faces".into(), "there is nothing to do; add [[faces]] or [[covers]]".into()));
+            return Err((
+                "faces".into(),
+                "there is nothing to do; add [[faces]] or [[covers]]".into(),
+            ));
         }
         let mut faces = HashSet::new();
         for face in &self.faces {
@@ -356,7 +361,10 @@ mod tests {
         };
         assert!(wrong("held_by", "holds").contains("holds"));
         let unknown = wrong("held_by = [\"top\"", "held_by = [\"roof\"");
-        assert!(unknown.contains("covers.top.held_by") && unknown.contains("roof"), "{unknown}");
+        assert!(
+            unknown.contains("covers.top.held_by") && unknown.contains("roof"),
+            "{unknown}"
+        );
         let circle = wrong("after_covers = [\"top\"]", "after_covers = [\"front\"]");
         assert!(circle.contains("faces.front_inner"), "{circle}");
     }

@@ -8,7 +8,7 @@
 //!   same tasks done the one that is nowhere earlier is dropped, and of the rest a number goes on which quadruples from round to round.
 //!   A round in which none was left out has proven its best;
 //! - **the bound**: the same search on relaxed tasks, in which arms that share a face take what no division of its screws can be below and
-//!   never wait for each other. The least bound of whatever a round left out is a lower bound of everything.
+//!   never wait for each other (a face is done in one go, its arms taken from its begin). The least bound of whatever a round left out is a lower bound of everything.
 
 use super::task::{After, Placed, Problem, SLACK_S, Task};
 use rand::{RngExt, SeedableRng};
@@ -213,7 +213,10 @@ impl<'a> Search<'a> {
         let mut search = Self {
             tasks,
             gap_s: vec![-1.0; variants.len() * variants.len()],
-            before: tasks.iter().map(|t| t.after.iter().fold(0, |set, a| set | 1 << a.task)).collect(),
+            before: tasks
+                .iter()
+                .map(|t| t.after.iter().fold(0, |set, a| set | 1 << a.task))
+                .collect(),
             least_table_s: tasks
                 .iter()
                 .map(|t| t.modes.iter().map(|m| m.table_s).fold(f64::INFINITY, f64::min))
@@ -256,7 +259,9 @@ impl<'a> Search<'a> {
         let (ma, mb) = (&ta.modes[a.mode], &tb.modes[b.mode]);
         for (i, one) in ma.arms.iter().enumerate() {
             for (j, other) in mb.arms.iter().enumerate() {
-                let (Some(one), Some(other)) = (one, other) else { continue };
+                let (Some(one), Some(other)) = (one, other) else {
+                    continue;
+                };
                 let apart = match i.cmp(&j) {
                     std::cmp::Ordering::Equal => {
                         gap_s = gap_s.max(one.busy_s);
@@ -279,18 +284,28 @@ impl<'a> Search<'a> {
 
     /// Least gap between two tasks in this order, over all ways; below 0 if some ways may overlap.
     fn least_gap_s(&self, first: usize, second: usize) -> f64 {
-        let pairs = self.of_task[first].clone().flat_map(|v| self.of_task[second].clone().map(move |w| (v, w)));
+        let pairs = self.of_task[first]
+            .clone()
+            .flat_map(|v| self.of_task[second].clone().map(move |w| (v, w)));
         pairs.map(|(v, w)| self.gap_between(v, w)).fold(f64::INFINITY, f64::min)
     }
 
     /// Longest ways to the end, by relaxation: predecessors may have higher numbers.
     fn set_tails(&mut self) {
         for k in 0..self.tasks.len() {
-            self.tail_s[k] = self.of_task[k].clone().map(|v| self.variants[v].end_s).fold(f64::INFINITY, f64::min);
+            self.tail_s[k] = self.of_task[k]
+                .clone()
+                .map(|v| self.variants[v].end_s)
+                .fold(f64::INFINITY, f64::min);
         }
         for _ in 0..self.tasks.len() {
             let mut is_still = true;
-            for (k, after) in self.tasks.iter().enumerate().flat_map(|(k, t)| t.after.iter().map(move |a| (k, a))) {
+            for (k, after) in self
+                .tasks
+                .iter()
+                .enumerate()
+                .flat_map(|(k, t)| t.after.iter().map(move |a| (k, a)))
+            {
                 let tail_s = self.least_gap_s(after.task, k) + self.tail_s[k];
                 if tail_s > self.tail_s[after.task] + SLACK_S {
                     self.tail_s[after.task] = tail_s;
@@ -309,7 +324,9 @@ impl<'a> Search<'a> {
         let mut before = self.before.clone();
         for _ in 0..n {
             for k in 0..n {
-                let through = (0..n).filter(|i| before[k] >> i & 1 == 1).fold(0, |set, i| set | before[i]);
+                let through = (0..n)
+                    .filter(|i| before[k] >> i & 1 == 1)
+                    .fold(0, |set, i| set | before[i]);
                 before[k] |= through;
             }
         }
@@ -501,7 +518,9 @@ impl<'a> Search<'a> {
                 tried[from] = rng.random_range(ways);
             } else {
                 let reach = 8.min(n - 1);
-                let to = (from + rng.random_range(1..=2 * reach)).saturating_sub(reach).min(n - 1);
+                let to = (from + rng.random_range(1..=2 * reach))
+                    .saturating_sub(reach)
+                    .min(n - 1);
                 let moved = tried.remove(from);
                 tried.insert(to, moved);
             }
@@ -594,7 +613,11 @@ impl<'a> Search<'a> {
             return false;
         }
         let is_open = |task: usize| a.done >> task & 1 == 0;
-        let variants = self.variants.iter().enumerate().filter(|(_, variant)| is_open(variant.task));
+        let variants = self
+            .variants
+            .iter()
+            .enumerate()
+            .filter(|(_, variant)| is_open(variant.task));
         for (v, _) in variants {
             if a.ready_s[v].max(a.last_s) > b.ready_s[v].max(b.last_s) + SLACK_S {
                 return false;
@@ -618,7 +641,15 @@ mod tests {
     use proptest::prelude::*;
 
     /// A small product: faces on random sides, covers in a random precedence, with alternatives or not.
-    fn small(faces: &[(u8, u8)], chained: bool, any: bool, seed: u64, arms: usize, tables: usize, units: usize) -> Problem {
+    fn small(
+        faces: &[(u8, u8)],
+        chained: bool,
+        any: bool,
+        seed: u64,
+        arms: usize,
+        tables: usize,
+        units: usize,
+    ) -> Problem {
         let mut rng = Pcg64Mcg::seed_from_u64(seed);
         let mut text = String::from("product = \"small\"\nloaded = \"s0\"\n");
         for (k, (side, screws)) in faces.iter().enumerate() {
@@ -627,14 +658,18 @@ mod tests {
                 let (across, up) = (rng.random_range(-400..400), rng.random_range(200..850));
                 places.push_str(&format!("[{across}, {up}],"));
             }
-            text.push_str(&format!("[[faces]]\nname = \"f{k}\"\nside = \"s{side}\"\nscrews_mm = [{places}]\n"));
+            text.push_str(&format!(
+                "[[faces]]\nname = \"f{k}\"\nside = \"s{side}\"\nscrews_mm = [{places}]\n"
+            ));
             if chained && k > 0 {
                 text.push_str(&format!("after_covers = [\"c{}\"]\n", k - 1));
             }
         }
         for (k, (side, _)) in faces.iter().enumerate() {
             let width: u32 = rng.random_range(200..800);
-            text.push_str(&format!("[[covers]]\nname = \"c{k}\"\nside = \"s{side}\"\nwidth_mm = {width}\n"));
+            text.push_str(&format!(
+                "[[covers]]\nname = \"c{k}\"\nside = \"s{side}\"\nwidth_mm = {width}\n"
+            ));
             if any && faces.len() > 1 {
                 text.push_str("requires_any = [{ faces = [\"f0\"] }, { faces = [\"f1\"] }]\n");
             } else {

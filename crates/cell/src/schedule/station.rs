@@ -1,7 +1,10 @@
 //! Where arms and tables stand, how long an arm takes from place to place, and the room it sweeps.
 
+use crate::motion::{Gp25, HOME_RAD};
+use crate::plan::tool_pose;
+use geometry::{Direction, Point, Transform};
+use nalgebra::UnitQuaternion;
 use serde::{Deserialize, Serialize};
-use std::f64::consts::{FRAC_PI_2, PI};
 
 /// A station that cannot be planned for.
 #[derive(Debug, thiserror::Error)]
@@ -60,7 +63,10 @@ impl Station {
             driver: true,
             gripper,
         };
-        let mut both = vec![arm("arm_a", 0.0, -300.0, arms == 1 || tables == 2), arm("arm_b", 700.0, 1000.0, true)];
+        let mut both = vec![
+            arm("arm_a", 0.0, -300.0, arms == 1 || tables == 2),
+            arm("arm_b", 700.0, 1000.0, true),
+        ];
         both.truncate(arms);
         Ok(Self {
             arms: both,
@@ -69,7 +75,7 @@ impl Station {
         })
     }
 
-    /// Time for arm `arm` from one place of its bit to another, square to the face (`None`: its rest), s; `None` out of its reach.
+    /// Time of the jerk-limited joint move of arm `arm` from one place of its bit to another, square to the face (`None`: its rest), s; `None` out of its reach.
     /// Places are x, y, z in the first arm's base, mm.
     pub fn travel_s(&self, arm: usize, from: Option<[f64; 3]>, to: Option<[f64; 3]>) -> Option<f64> {
         let arm = &self.arms[arm];
@@ -77,10 +83,12 @@ impl Station {
             Some([x, y, z]) => joints_rad([x, y - arm.base_y_mm, z]),
             None => {
                 let aside_rad = (arm.rest_y_mm - arm.base_y_mm).atan2(REST_X_MM);
-                Some([aside_rad, -0.6, -0.2, 0.0, 0.9, 0.0])
+                let mut rest_rad = HOME_RAD;
+                rest_rad[0] = aside_rad;
+                Some(rest_rad)
             }
         };
-        Some(joint_time_s(joints(from)?, joints(to)?))
+        Some(Gp25::travel_s(joints(from)?, joints(to)?))
     }
 }
 
@@ -118,65 +126,14 @@ impl Strip {
 
 /// How far before its base an arm at rest holds its wrist, mm.
 const REST_X_MM: f64 = 650.0;
-/// Bit and flange before the wrist centre, mm.
-const WRIST_TO_BIT_MM: f64 = 400.0;
-/// From J1's axis to J2's, mm.
-const A1_MM: f64 = 150.0;
-/// Height of J2 above the foot, mm.
-const C1_MM: f64 = 505.0;
-/// Upper arm, mm.
-const C2_MM: f64 = 760.0;
-/// Forearm along and across, mm.
-const FOREARM_MM: [f64; 2] = [795.0, 200.0];
-/// Limits of J2, J3 and J5 (the others turn by far enough), degrees.
-const LIMITS_DEG: [(usize, f64, f64); 3] = [(1, -105.0, 155.0), (2, -86.0, 160.0), (4, -155.0, 150.0)];
-/// Joint speeds, degrees a second.
-const SPEEDS_DEG_S: [f64; 6] = [210.0, 210.0, 265.0, 420.0, 420.0, 885.0];
-/// From standstill to full speed under the jerk limit, s.
-const RISE_S: f64 = 0.3;
-/// Until the controller reports "in position", s.
-const SETTLE_S: f64 = 0.08;
+/// The bit's tip from the flange, mm: straight ahead and 40 mm aside, as the simulated cell is drawn.
+const TOOL_MM: [f64; 3] = [0.0, -40.0, 300.0];
 
-/// Joint angles of a GP25 with the bit square to the face (along base x), elbow up; `None` out of reach. The bit's 40 mm aside are left out.
+/// Joint angles with the bit square to the face at a place in the arm's own base; `None` out of reach.
 fn joints_rad([x_mm, y_mm, z_mm]: [f64; 3]) -> Option<[f64; 6]> {
-    let wrist_x_mm = x_mm - WRIST_TO_BIT_MM;
-    let j1 = y_mm.atan2(wrist_x_mm);
-    // the plane of upper arm and forearm: away from J2 and up
-    let (out_mm, up_mm) = (wrist_x_mm.hypot(y_mm) - A1_MM, z_mm - C1_MM);
-    let (reach_mm, forearm_mm) = (out_mm.hypot(up_mm), FOREARM_MM[0].hypot(FOREARM_MM[1]));
-    let cos = (C2_MM.powi(2) + reach_mm.powi(2) - forearm_mm.powi(2)) / (2.0 * C2_MM * reach_mm);
-    if wrist_x_mm <= 0.0 || !(-1.0..=1.0).contains(&cos) {
-        return None;
-    }
-    let upper = up_mm.atan2(out_mm) + cos.acos();
-    let line = (up_mm - C2_MM * upper.sin()).atan2(out_mm - C2_MM * upper.cos());
-    let forearm = line - FOREARM_MM[1].atan2(FOREARM_MM[0]);
-    let j2 = FRAC_PI_2 - upper;
-    // the bit as the forearm sees it: ahead, aside, above
-    let ahead = forearm.cos() * j1.cos();
-    let (aside, above) = (-j1.sin(), -forearm.sin() * j1.cos());
-    let j5 = ahead.clamp(-1.0, 1.0).acos();
-    let j4 = aside.atan2(above);
-    let joints = [j1, j2, forearm + j2, j4, j5, -j4];
-    let is_within = |&(j, low, high): &(usize, f64, f64)| (low..=high).contains(&joints[j].to_degrees());
-    LIMITS_DEG.iter().all(is_within).then_some(joints)
-}
-
-/// Shortest time for a motion of all joints together, s: the slowest joint decides; each rises to its limit with a limited jerk.
-fn joint_time_s(from_rad: [f64; 6], to_rad: [f64; 6]) -> f64 {
-    let time_s = |j: usize| {
-        let speed = SPEEDS_DEG_S[j].to_radians();
-        let mut way = (to_rad[j] - from_rad[j]).abs();
-        if matches!(j, 3 | 5) && way > PI {
-            way = 2.0 * PI - way;
-        }
-        if way >= speed * RISE_S {
-            way / speed + RISE_S
-        } else {
-            2.0 * (way * RISE_S / speed).sqrt()
-        }
-    };
-    (0..6).map(time_s).fold(0.0, f64::max) + SETTLE_S
+    let arm = Gp25::new(Transform::from_parts(TOOL_MM, UnitQuaternion::identity()));
+    let ahead = Direction::new(1.0, 0.0, 0.0)?;
+    arm.inverse(tool_pose(Point::new(x_mm, y_mm, z_mm), ahead)).ok()
 }
 
 #[cfg(test)]
@@ -191,7 +148,10 @@ mod tests {
                 for (y, z) in [(-430.0, 160.0), (-430.0, 890.0), (430.0, 160.0), (430.0, 890.0)] {
                     let at = [1070.0, station.tables_y_mm[table] + y, z];
                     let time_s = station.travel_s(arm, None, Some(at));
-                    assert!(time_s.is_some_and(|t| (0.3..1.5).contains(&t)), "{arm} {at:?} {time_s:?}");
+                    assert!(
+                        time_s.is_some_and(|t| (0.3..1.5).contains(&t)),
+                        "{arm} {at:?} {time_s:?}"
+                    );
                 }
             }
         }
@@ -207,7 +167,7 @@ mod tests {
             station.travel_s(0, Some([1070.0, 0.0, 500.0]), to).expect("in reach")
         };
         assert!(time_s(100.0) < time_s(200.0) && time_s(200.0) < time_s(400.0));
-        assert_eq!(time_s(0.0), SETTLE_S);
+        assert!(time_s(0.0) < 0.2);
     }
 
     #[test]

@@ -192,7 +192,11 @@ impl Problem {
     /// [`ProblemError`] naming the face or cover.
     pub fn new(product: &Product, station: &Station, units: usize) -> Result<Self, ProblemError> {
         let mut sides = vec![product.loaded.clone()];
-        let named = product.faces.iter().map(|f| &f.side).chain(product.covers.iter().map(|c| &c.side));
+        let named = product
+            .faces
+            .iter()
+            .map(|f| &f.side)
+            .chain(product.covers.iter().map(|c| &c.side));
         for side in named {
             if !sides.contains(side) {
                 sides.push(side.clone());
@@ -208,7 +212,9 @@ impl Problem {
         };
         let mut discharged = Vec::new();
         for unit in 0..units {
-            let free = unit.checked_sub(station.tables_y_mm.len()).map(|before| discharged[before]);
+            let free = unit
+                .checked_sub(station.tables_y_mm.len())
+                .map(|before| discharged[before]);
             discharged.push(builder.unit(unit, free)?);
         }
         let (tasks, relaxed) = (builder.tasks, builder.relaxed);
@@ -237,7 +243,10 @@ impl Problem {
         for task in 0..self.tasks.len() {
             let times = placed.iter().filter(|p| p.task == task).count();
             if times != 1 {
-                return Err(Violation::Times { task: name(task), times });
+                return Err(Violation::Times {
+                    task: name(task),
+                    times,
+                });
             }
         }
         let mode = |p: &Placed| &self.tasks[p.task].modes[p.mode];
@@ -294,8 +303,18 @@ impl Problem {
                 return Some("another side of the table");
             }
         }
-        for (a, used) in mp.arms.iter().enumerate().filter_map(|(a, u)| u.as_ref().map(|u| (a, u))) {
-            for (b, other) in mq.arms.iter().enumerate().filter_map(|(b, u)| u.as_ref().map(|u| (b, u))) {
+        for (a, used) in mp
+            .arms
+            .iter()
+            .enumerate()
+            .filter_map(|(a, u)| u.as_ref().map(|u| (a, u)))
+        {
+            for (b, other) in mq
+                .arms
+                .iter()
+                .enumerate()
+                .filter_map(|(b, u)| u.as_ref().map(|u| (b, u)))
+            {
                 if a == b && overlap(used.busy_s, other.busy_s) {
                     return Some("one arm");
                 }
@@ -371,7 +390,14 @@ impl Builder<'_> {
                 lag_s: times.process,
             });
             let screws = self.push(screws, Some(least));
-            let mut second = blank(Kind::SecondLook, k, &format!("{name} second look"), side, true, vec![look]);
+            let mut second = blank(
+                Kind::SecondLook,
+                k,
+                &format!("{name} second look"),
+                side,
+                true,
+                vec![look],
+            );
             second.after.push(After {
                 task: screws,
                 lag_s: 0.0,
@@ -402,7 +428,8 @@ impl Builder<'_> {
             let mut pull = blank(Kind::Cover, k, &format!("{} cover", cover.name), side, false, modes);
             pull.after.push(loaded(side));
             pull.after.extend(cover.held_by.iter().filter_map(out));
-            pull.after.extend(cover.after_covers.iter().filter_map(|name| off(name)));
+            pull.after
+                .extend(cover.after_covers.iter().filter_map(|name| off(name)));
             pull.after_any = cover
                 .requires_any
                 .iter()
@@ -429,7 +456,11 @@ impl Builder<'_> {
             last.push(self.push(cover, None));
         }
         let mut discharge = blank(Kind::Discharge, 0, "discharge", None, true, vec![idle(times.discharge)]);
-        discharge.after = last.into_iter().chain([load]).map(|task| After { task, lag_s: 0.0 }).collect();
+        discharge.after = last
+            .into_iter()
+            .chain([load])
+            .map(|task| After { task, lag_s: 0.0 })
+            .collect();
         Ok(self.push(discharge, None))
     }
 
@@ -472,7 +503,10 @@ impl Builder<'_> {
         }
         // each arm's exact tours on a core of its own: the largest faces take half a second
         let tours: Vec<Option<Tours>> = std::thread::scope(|scope| {
-            let jobs: Vec<_> = able.iter().map(|(_, costs)| scope.spawn(|| Tours::new(costs))).collect();
+            let jobs: Vec<_> = able
+                .iter()
+                .map(|(_, costs)| scope.spawn(|| Tours::new(costs)))
+                .collect();
             jobs.into_iter().map(|job| job.join().unwrap_or(None)).collect()
         });
         let y_mm: Vec<f64> = places.iter().map(|at| at[1]).collect();
@@ -490,12 +524,19 @@ impl Builder<'_> {
             let rest_y_mm = [*a, *b].map(|arm| self.station.arms[arm].rest_y_mm);
             if let Some(shared) = tour::share(arms, &y_mm, rest_y_mm, self.station.clearance_mm) {
                 let [right, left] = &shared.orders;
-                let parts = [(*a, first, right, shared.wait_s[0]), (*b, second, left, shared.wait_s[1])];
+                let parts = [
+                    (*a, first, right, shared.wait_s[0]),
+                    (*b, second, left, shared.wait_s[1]),
+                ];
                 modes.push(self.screws_mode(&parts, &y_mm));
             }
         }
         // the same ways at their least, and the two arms together in classes of divisions
-        let longest_lead_s = able.iter().flat_map(|(_, costs)| &costs.out_s).copied().fold(0.0, f64::max);
+        let longest_lead_s = able
+            .iter()
+            .flat_map(|(_, costs)| &costs.out_s)
+            .copied()
+            .fold(0.0, f64::max);
         let mut relaxed: Vec<Mode> = Vec::new();
         for (((_, costs), tours), mode) in able.iter().zip(&tours).zip(&modes) {
             let least_s = tour::least_alone_s(costs, tours.as_ref());
@@ -533,8 +574,14 @@ impl Builder<'_> {
         let between = |&from: &[f64; 3]| places.iter().map(|&to| travel_s(Some(from), Some(to))).collect();
         Some(Costs {
             between_s: places.iter().map(between).collect::<Option<_>>()?,
-            out_s: places.iter().map(|&to| travel_s(None, Some(to))).collect::<Option<_>>()?,
-            back_s: places.iter().map(|&from| travel_s(Some(from), None)).collect::<Option<_>>()?,
+            out_s: places
+                .iter()
+                .map(|&to| travel_s(None, Some(to)))
+                .collect::<Option<_>>()?,
+            back_s: places
+                .iter()
+                .map(|&from| travel_s(Some(from), None))
+                .collect::<Option<_>>()?,
             drive_s: self.product.times_s.drive,
         })
     }

@@ -38,7 +38,8 @@ impl Costs {
             let others = (0..self.len()).filter(|&j| j != i).map(|j| self.between_s[j][i]);
             others.fold(self.out_s[i], f64::min)
         };
-        screws.map(|i| self.drive_s + nearest(i)).sum::<f64>() + self.back_s.iter().copied().fold(f64::INFINITY, f64::min)
+        screws.map(|i| self.drive_s + nearest(i)).sum::<f64>()
+            + self.back_s.iter().copied().fold(f64::INFINITY, f64::min)
     }
 }
 
@@ -108,10 +109,14 @@ impl<'a> Tours<'a> {
         while left != 0 {
             // the screw after which the rest of the way is shortest
             let onward = |last: usize| {
-                let way = order.last().map_or(self.costs.back_s[last], |&next: &usize| self.costs.between_s[last][next]);
+                let way = order.last().map_or(self.costs.back_s[last], |&next: &usize| {
+                    self.costs.between_s[last][next]
+                });
                 f64::from(self.to_s[left * self.stride + last]) + way
             };
-            let last = (0..n).filter(|k| left >> k & 1 == 1).min_by(|&a, &b| onward(a).total_cmp(&onward(b)));
+            let last = (0..n)
+                .filter(|k| left >> k & 1 == 1)
+                .min_by(|&a, &b| onward(a).total_cmp(&onward(b)));
             let Some(last) = last else { break };
             left &= !(1 << last);
             order.push(last);
@@ -242,7 +247,10 @@ pub fn share(
         let ways = [0, 1].map(|side| ways(arms[side], sides[side]));
         for (right, left) in ways[0].iter().flat_map(|r| ways[1].iter().map(move |l| (r, l))) {
             let times_s = [arms[0].0.time_s(right), arms[1].0.time_s(left)];
-            if best.as_ref().is_some_and(|best| times_s[0].max(times_s[1]) >= best.span_s) {
+            if best
+                .as_ref()
+                .is_some_and(|best| times_s[0].max(times_s[1]) >= best.span_s)
+            {
                 continue;
             }
             let sweeps = [
@@ -355,7 +363,12 @@ mod tests {
         }
         let mut all = Vec::new();
         for (k, &first) in items.iter().enumerate() {
-            let rest: Vec<usize> = items.iter().enumerate().filter(|(i, _)| *i != k).map(|(_, &v)| v).collect();
+            let rest: Vec<usize> = items
+                .iter()
+                .enumerate()
+                .filter(|(i, _)| *i != k)
+                .map(|(_, &v)| v)
+                .collect();
             for mut tail in permutations(&rest) {
                 tail.insert(0, first);
                 all.push(tail);
@@ -430,7 +443,9 @@ mod tests {
             let tours = Tours::new(&a).expect("small");
             let arm = (&a, Some(&tours));
             let rest = [-300.0, 1000.0];
-            let Some(found) = share([arm, arm], &y_mm, rest, 300.0) else { continue };
+            let Some(found) = share([arm, arm], &y_mm, rest, 300.0) else {
+                continue;
+            };
             let [right, left] = [0, 1].map(|side| sweeps(&a, &found.orders[side], &y_mm, rest[side]));
             for (r, l) in right.iter().flat_map(|r| left.iter().map(move |l| (r, l))) {
                 let together = r.from_s + found.wait_s[0] < l.to_s + found.wait_s[1] - 1e-6

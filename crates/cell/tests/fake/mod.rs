@@ -169,6 +169,22 @@ impl Fake {
     }
 }
 
+/// Where its arms stand, whatever they are told: before the middle of a face, and every way from there is free.
+pub fn rest_rad() -> [f64; 6] {
+    let drawing = cell::motion::CellDrawing::default();
+    let arm = cell::motion::ArmMotion::new(&drawing, "arm_a").expect("a drawn arm");
+    let ahead = Direction::new(1.0, 0.0, 0.0).expect("x");
+    let rest = cell::plan::tool_pose(Point::new(800.0, 0.0, 600.0), ahead);
+    arm.arm().inverse(rest).expect("in reach")
+}
+
+/// A cell whose arms rest there.
+pub fn config() -> cell::CellConfig {
+    let mut config = cell::CellConfig::simulated();
+    config.motion.arms[0].home_rad = rest_rad();
+    config
+}
+
 pub fn camera() -> CameraModel {
     CameraModel::pinhole(1024, 768, 1100.0, 1100.0)
 }
@@ -359,7 +375,7 @@ impl RobotArm for FakeArm {
             alarm: None,
             emergency_stop: false,
             base_from_tool: self.fake.world().pose[self.index],
-            joints_rad: [0.0; 6],
+            joints_rad: rest_rad(),
             age_s: 0.01,
         })
     }

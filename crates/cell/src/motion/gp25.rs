@@ -1,8 +1,10 @@
-//! Where the controller of a GP25 believes its tool is: nominal kinematics, limits and times.
+//! Where the controller of a GP25 believes its tool is: nominal kinematics and limits.
 //!
 //! `Base` is the robot's foot (`base_link`, as in the reference pairs): x forward, y left, z up from the foot.
 //! Yaskawa's own base frame lies 505 mm above it; only a wire codec has to know.
 
+use super::profile::Limits;
+use super::trajectory::Trajectory;
 use geometry::{Base, Flange, Tool, Transform};
 use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion, Vector3};
 use rs_opw_kinematics::{
@@ -15,17 +17,17 @@ use rs_opw_kinematics::{
 use std::f64::consts::{FRAC_PI_2, PI};
 
 /// Distance from J1 to J2 along x, mm.
-pub(crate) const A1_MM: f64 = 150.0;
+pub const A1_MM: f64 = 150.0;
 /// Offset of the forearm from J3 along its own x, mm.
-pub(crate) const A2_MM: f64 = -200.0;
+pub const A2_MM: f64 = -200.0;
 /// Height of J2 above the foot, mm.
-pub(crate) const C1_MM: f64 = 505.0;
+pub const C1_MM: f64 = 505.0;
 /// Upper arm, mm.
-pub(crate) const C2_MM: f64 = 760.0;
+pub const C2_MM: f64 = 760.0;
 /// Forearm, mm.
-pub(crate) const C3_MM: f64 = 795.0;
+pub const C3_MM: f64 = 795.0;
 /// Wrist centre to flange, mm.
-pub(crate) const C4_MM: f64 = 100.0;
+pub const C4_MM: f64 = 100.0;
 /// Encoder angle where the model stands straight up, rad.
 const OFFSETS_RAD: [f64; 6] = [0.0, 0.0, -FRAC_PI_2, 0.0, 0.0, PI];
 /// Direction of each joint.
@@ -41,14 +43,10 @@ const LIMITS_DEG: [(f64, f64); 6] = [
 ];
 /// Joint speed limits, degrees a second.
 const SPEEDS_DEG_S: [f64; 6] = [210.0, 210.0, 265.0, 420.0, 420.0, 885.0];
-/// Time from standstill to full speed, s.
-const RISE_S: f64 = 0.3;
-/// Time until the controller reports "in position" after the last motion, s.
-const SETTLE_S: f64 = 0.08;
 /// The wrist may not come nearer to its singularity than this, rad.
 const WRIST_MARGIN_RAD: f64 = 0.14;
 
-/// Joint angles of the rest position: tool high above the camera's view.
+/// Joint angles of the rest position unless a cell has its own: tool high above the camera's view.
 pub const HOME_RAD: [f64; 6] = [0.0, -0.6, -0.2, 0.0, 0.9, 0.0];
 /// The middle of the arm's configuration (elbow up, wrist not flipped) in which it always works: one configuration
 /// keeps the errors of the arm a smooth function of the place.
@@ -66,6 +64,9 @@ pub enum Unreachable {
     /// NaN or infinite numbers.
     #[error("the target is not finite")]
     NotFinite,
+    /// On a straight line the joints would have to change over to another configuration.
+    #[error("the arm would have to turn over near ({0:.1}, {1:.1}, {2:.1}) mm on the straight line")]
+    TurnsOver(f64, f64, f64),
 }
 
 /// A GP25 with its tool, as its controller knows it.
@@ -112,8 +113,7 @@ impl Gp25 {
 
     /// Pose of the tool for joint angles.
     pub fn forward(&self, joints_rad: [f64; 6]) -> Transform<Base, Tool> {
-        Transform::<Base, Flange>::from_isometry(chain(model_angles(joints_rad), &Links::NOMINAL))
-            * self.flange_from_tool
+        Links::NOMINAL.flange(model_angles(joints_rad)) * self.flange_from_tool
     }
 
     /// Joint angles for a pose of the tool, in the working configuration.
@@ -155,33 +155,20 @@ impl Gp25 {
         Ok(joints)
     }
 
-    /// Shortest time for a motion of all joints together, s: each joint rises to its speed limit within 0.3 s with a
-    /// limited jerk, the slowest one decides.
-    pub fn joint_time_s(from_rad: [f64; 6], to_rad: [f64; 6]) -> f64 {
-        let slowest = (0..6)
-            .map(|j| trapezoid_s((to_rad[j] - from_rad[j]).abs(), SPEEDS_DEG_S[j].to_radians()))
-            .fold(0.0, f64::max);
-        slowest + SETTLE_S
+    /// Time of a joint move from rest to rest, s: every joint within its limits of speed, acceleration and jerk, all of them
+    /// together, the slowest one decides. What a controller takes to report "in position" comes on top.
+    pub fn travel_s(from_rad: [f64; 6], to_rad: [f64; 6]) -> f64 {
+        Trajectory::joint(from_rad, to_rad).duration_s()
     }
 
-    /// Time for a straight line of the tool point at this speed, s.
-    pub fn linear_time_s(distance_mm: f64, speed_mm_s: f64) -> f64 {
-        trapezoid_s(distance_mm, speed_mm_s.max(0.1)) + SETTLE_S
-    }
-}
-
-/// Time for a way with a trapezoid of speed, s; short ways never reach full speed.
-fn trapezoid_s(way: f64, speed: f64) -> f64 {
-    let rise_way = speed * RISE_S;
-    if way >= rise_way {
-        way / speed + RISE_S
-    } else {
-        2.0 * (way * RISE_S / speed).sqrt()
+    /// What each joint may do, in rad.
+    pub fn joint_limits() -> [Limits; 6] {
+        SPEEDS_DEG_S.map(|speed| Limits::of_speed(speed.to_radians()))
     }
 }
 
 /// True if every joint is inside its range.
-pub(crate) fn within_limits(joints_rad: &[f64; 6]) -> bool {
+pub fn within_limits(joints_rad: &[f64; 6]) -> bool {
     joints_rad
         .iter()
         .zip(LIMITS_DEG)
@@ -189,17 +176,17 @@ pub(crate) fn within_limits(joints_rad: &[f64; 6]) -> bool {
 }
 
 /// Angles of the model (straight up at zero) for encoder angles.
-pub(crate) fn model_angles(joints_rad: [f64; 6]) -> [f64; 6] {
+pub fn model_angles(joints_rad: [f64; 6]) -> [f64; 6] {
     std::array::from_fn(|j| joints_rad[j] * SIGNS[j] - OFFSETS_RAD[j])
 }
 
 /// The rigid parts between the joints, base to flange: part `i` lies before joint `i + 1`, the last one after J6.
 #[derive(Clone, Debug)]
-pub(crate) struct Links(pub [Isometry3<f64>; 7]);
+pub struct Links(pub [Isometry3<f64>; 7]);
 
 impl Links {
     /// Lengths as in the data sheet.
-    pub(crate) const NOMINAL: Links = Links([
+    pub const NOMINAL: Links = Links([
         at(0.0, 0.0, 0.0),
         at(A1_MM, 0.0, C1_MM),
         at(0.0, 0.0, C2_MM),
@@ -208,6 +195,26 @@ impl Links {
         at(0.0, 0.0, 0.0),
         at(0.0, 0.0, C4_MM),
     ]);
+
+    /// Poses in the base, from the foot to the flange: entry `i` has turned with `i` joints and lies at the far end of part `i`.
+    pub fn poses(&self, model_rad: [f64; 6]) -> [Isometry3<f64>; 7] {
+        let mut poses = [self.0[0]; 7];
+        // J1, J4 and J6 turn about z, the others about y
+        for (j, angle) in model_rad.into_iter().enumerate() {
+            let axis = if matches!(j, 0 | 3 | 5) {
+                Vector3::z_axis()
+            } else {
+                Vector3::y_axis()
+            };
+            poses[j + 1] = poses[j] * UnitQuaternion::from_axis_angle(&axis, angle) * self.0[j + 1];
+        }
+        poses
+    }
+
+    /// Pose of the flange.
+    pub fn flange(&self, model_rad: [f64; 6]) -> Transform<Base, Flange> {
+        Transform::from_isometry(self.poses(model_rad)[6])
+    }
 }
 
 const fn at(x: f64, y: f64, z: f64) -> Isometry3<f64> {
@@ -219,44 +226,51 @@ const fn at(x: f64, y: f64, z: f64) -> Isometry3<f64> {
     }
 }
 
-/// Poses of everything from base to flange: the product of links and joints. J1, J4 and J6 turn about z, the others about y.
-pub(crate) fn chain(model_rad: [f64; 6], links: &Links) -> Isometry3<f64> {
-    let mut pose = links.0[0];
-    for (j, angle) in model_rad.into_iter().enumerate() {
-        let axis = if matches!(j, 0 | 3 | 5) {
-            Vector3::z_axis()
-        } else {
-            Vector3::y_axis()
-        };
-        pose = pose * UnitQuaternion::from_axis_angle(&axis, angle) * links.0[j + 1];
-    }
-    pose
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::draw::{draw, signed};
-    use crate::layout;
-    use geometry::Point;
+    use crate::plan::tool_pose;
+    use geometry::{Direction, Point};
+    use proptest::prelude::*;
+
+    const TOOL_MM: [f64; 3] = [0.0, -40.0, 300.0];
 
     fn arm() -> Gp25 {
-        Gp25::new(layout::flange_from_tool())
+        Gp25::new(Transform::from_parts(TOOL_MM, UnitQuaternion::identity()))
     }
 
-    #[test]
-    fn forward_agrees_with_the_reference_solver() {
-        let arm = Gp25::new(Transform::identity());
-        let mut rng = draw(3, &[]);
-        for _ in 0..200 {
-            let q: [f64; 6] = std::array::from_fn(|_| 2.0 * signed(&mut rng));
+    proptest! {
+        #[test]
+        fn forward_agrees_with_the_reference_solver(q in prop::array::uniform6(-2.0..2.0f64)) {
+            let arm = Gp25::new(Transform::identity());
             let own = *arm.forward(q).isometry();
             let pose = arm.solver.forward(&q);
             let t = pose.translation * 1000.0;
-            assert!((own.translation.vector - Vector3::new(t.x, t.y, t.z)).norm() < 1e-6);
+            prop_assert!((own.translation.vector - Vector3::new(t.x, t.y, t.z)).norm() < 1e-6);
             let r = pose.rotation;
             let r = UnitQuaternion::from_quaternion(Quaternion::new(r.w, r.x, r.y, r.z));
-            assert!(own.rotation.angle_to(&r) < 1e-6);
+            prop_assert!(own.rotation.angle_to(&r) < 1e-6);
+        }
+
+        /// Over the calibrated volume of either arm, and for every lean of a sheet that is worked on.
+        #[test]
+        fn inverse_and_forward_are_a_round_trip(
+            x in 910.0..1350.0f64, y in -1150.0..450.0f64, z in 150.0..900.0f64,
+            lean in -0.2..0.2f64, turn in -0.2..0.2f64,
+        ) {
+            // the second arm stands 700 mm beside the first and works on the same faces
+            prop_assume!(y.abs() < 450.0 || y < -250.0);
+            let approach = Direction::new(1.0, lean, turn).expect("a direction");
+            let target = tool_pose(Point::new(x, y, z), approach);
+            match arm().inverse(target) {
+                Ok(q) => {
+                    prop_assert!(within_limits(&q), "{q:?}");
+                    let off = arm().forward(q).isometry().inv_mul(target.isometry());
+                    prop_assert!(off.translation.vector.norm() < 1e-4 && off.rotation.angle() < 1e-6, "{off}");
+                }
+                // the far corners of the second arm lean out of its reach, and nothing else does
+                Err(why) => prop_assert!(x.hypot(y) > 1500.0, "({x:.0}, {y:.0}, {z:.0}): {why}"),
+            }
         }
     }
 
@@ -270,54 +284,15 @@ mod tests {
     }
 
     #[test]
-    fn both_arms_reach_the_whole_lattice_clear_of_the_singularity() {
-        for index in 0..2 {
-            let [low, high] = layout::volume(index);
-            for (i, j, k) in (0..9).flat_map(|i| (0..19).flat_map(move |j| (0..16).map(move |k| (i, j, k)))) {
-                // 40 mm nearer than the lattice too: from there the bit goes in
-                for back_mm in [0.0, 40.0] {
-                    let at = Point::new(
-                        low.x_mm() + 50.0 * f64::from(i) - back_mm,
-                        low.y_mm() + 50.0 * f64::from(j),
-                        low.z_mm() + 50.0 * f64::from(k),
-                    );
-                    assert!(at.x_mm() <= high.x_mm() && at.y_mm() <= high.y_mm() && at.z_mm() <= high.z_mm());
-                    let target = layout::tool_at(at);
-                    let q = arm()
-                        .inverse(target)
-                        .unwrap_or_else(|e| panic!("arm {index} at {at:?}: {e}"));
-                    let reached = arm().forward(q) * Point::new(0.0, 0.0, 0.0);
-                    assert!(reached.distance_mm(at) < 1e-3);
-                    assert!(q[4] > 0.5, "J5 at {} rad is near its singularity at {at:?}", q[4]);
-                }
-            }
-        }
-    }
-
-    #[test]
-    fn one_configuration_everywhere() {
-        let [low, high] = layout::volume(0);
-        let mut last: Option<[f64; 6]> = None;
-        for step in 0..=200 {
-            let t = f64::from(step) / 200.0;
-            let at = Point::from_vector(low.vector() + (high.vector() - low.vector()) * t);
-            let q = arm().inverse(layout::tool_at(at)).expect("in reach");
-            if let Some(before) = last {
-                assert!((0..6).all(|j| (q[j] - before[j]).abs() < 0.1), "a jump at {at:?}");
-            }
-            last = Some(q);
-        }
-    }
-
-    #[test]
-    fn times_follow_the_speed_limits() {
-        assert!((trapezoid_s(210.0, 210.0) - 1.3).abs() < 1e-9);
-        assert!((trapezoid_s(63.0, 210.0) - 0.6).abs() < 1e-9);
-        assert_eq!(Gp25::joint_time_s(HOME_RAD, HOME_RAD), SETTLE_S);
-        let work = arm()
-            .inverse(layout::tool_at(Point::new(1060.0, 300.0, 300.0)))
-            .expect("in reach");
-        let time_s = Gp25::joint_time_s(HOME_RAD, work);
-        assert!((0.5..1.5).contains(&time_s), "{time_s} s from home to work");
+    fn what_cannot_be_taken_is_refused_with_the_reason() {
+        let ahead = Direction::new(1.0, 0.0, 0.0).expect("a direction");
+        let far = arm().inverse(tool_pose(Point::new(2300.0, 0.0, 500.0), ahead));
+        assert!(matches!(far, Err(Unreachable::OutOfReach(..))), "{far:?}");
+        let nowhere = arm().inverse(tool_pose(Point::new(f64::NAN, 0.0, 500.0), ahead));
+        assert_eq!(nowhere, Err(Unreachable::NotFinite));
+        // the forearm lies along the bit: J4 and J6 turn about the same axis
+        let singular = arm().forward([0.0, 0.4, -0.7, 0.0, 0.05, 0.0]);
+        let refused = arm().inverse(singular);
+        assert!(matches!(refused, Err(Unreachable::WristSingularity(..))), "{refused:?}");
     }
 }
