@@ -45,6 +45,7 @@ pub mod program;
 pub mod record;
 pub mod removal;
 pub mod run;
+pub mod schedule;
 pub mod statistics;
 
 pub use calibrate::{CaptureSettings, CaptureSummary, capture_pairs};

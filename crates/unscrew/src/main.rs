@@ -11,8 +11,10 @@ mod curve;
 mod detect;
 mod diagnosis;
 mod evaluate;
+mod gantt;
 mod model;
 mod output;
+mod plan;
 mod report;
 mod run;
 mod simulate;
@@ -56,6 +58,8 @@ enum Command {
     Synth(synth::Args),
     /// What a cell would do with thousands of units: completion, time, people, cells for a year's volume.
     Simulate(simulate::Args),
+    /// Schedule for a product description over arms and tables, with a lower bound and a chart.
+    Plan(plan::Args),
     /// Rates with bounds and times by resource, from a run's journal.
     Stats(stats::Args),
 }
@@ -84,6 +88,7 @@ fn main() -> ExitCode {
         Command::Model(command) => model::run(&command),
         Command::Synth(args) => synth::run(&args),
         Command::Simulate(args) => simulate::run(&args),
+        Command::Plan(args) => plan::run(&args),
         Command::Stats(args) => stats::run(&args),
     };
     match result {

@@ -136,6 +136,23 @@ fn wrong_usage_is_exit_code_2() {
 }
 
 #[test]
+fn a_plan_keeps_the_contract() {
+    let folder = folder();
+    let told = unscrew(folder.path(), &["plan", "--json", "--gantt", "plan.html"]);
+    assert_eq!(told.status.code(), Some(0));
+    let plan: serde_json::Value = serde_json::from_slice(&told.stdout).expect("JSON");
+    let number = |key: &str| plan[key].as_f64().expect(key);
+    assert!(number("bound_s") <= number("makespan_s") && number("gap") < 0.1);
+    assert!(plan["steps"].as_array().is_some_and(|steps| steps.len() == 20));
+    let page = std::fs::read_to_string(folder.path().join("plan.html")).expect("the page");
+    assert!(page.contains("<svg") && page.contains("bound"));
+    let ended = unscrew(folder.path(), &["plan", "--gap-max", "0"]).status.code();
+    assert_eq!(ended, Some(3));
+    std::fs::write(folder.path().join("odd.toml"), "product = \"x\"\nloaded = \"front\"\nscrew = 3\n").expect("written");
+    refused(folder.path(), &["plan", "odd.toml"], &["odd.toml", "screw"]);
+}
+
+#[test]
 fn a_tiny_picture_is_a_picture() {
     let dir = folder();
     picture(dir.path().join("dot.png"), 1, 1);

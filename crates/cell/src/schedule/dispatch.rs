@@ -1,0 +1,865 @@
+//! A plan carried out: what may begin is commanded, what ended is told, and nothing is ever waited for in a circle.
+//!
+//! The dispatcher knows no clock: it keeps the plan's order wherever two tasks need the same thing, and begins everything else as soon as
+//! it may. Real durations differ from planned ones, so the room before the tables is divided into zones with a lock each:
+//!
+//! - an arm takes all zones of its next motion at once, from right to left, or none of them;
+//! - an arm that does not get them goes back to rest, where it holds none, and waits there.
+//!
+//! Whoever holds a zone is therefore in motion or at work and waits for nobody: no circle of waits can form. What an arm takes reaches
+//! from its own side to its furthest place, so that arms can neither meet nor cross.
+//!
+//! A screw that does not come out is tried again after the others of its arm; if it stays, the covers that it holds stay too, and whatever
+//! needs them off is dropped. A unit is discharged in any case, once it was loaded.
+
+use super::station::Station;
+use super::task::{Kind, Placed, Problem};
+use std::collections::{BTreeMap, VecDeque};
+
+/// Width of a zone, mm.
+const ZONE_MM: f64 = 50.0;
+
+/// One thing to do, for one device.
+#[derive(Clone, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub enum Work {
+    /// Feed a unit onto its table.
+    Load {
+        /// Number of the unit.
+        unit: usize,
+        /// Number of the table.
+        table: usize,
+    },
+    /// Turn a side to the camera.
+    Turn {
+        /// Number of the table.
+        table: usize,
+        /// Number of the side in [`Problem::sides`].
+        side: usize,
+    },
+    /// Take a picture; the view is clear.
+    Picture {
+        /// Number of the task, a first or a second look.
+        task: usize,
+    },
+    /// Work out what the picture says. A second look that finds a screw still in has failed.
+    Process {
+        /// Number of the task, a first or a second look.
+        task: usize,
+    },
+    /// Go to a screw and drive it out.
+    Drive {
+        /// Number of the task.
+        task: usize,
+        /// Number of the arm.
+        arm: usize,
+        /// Number of the screw on its face.
+        screw: usize,
+        /// 0 the first time.
+        attempt: u8,
+    },
+    /// Go back to rest.
+    Withdraw {
+        /// Number of the arm.
+        arm: usize,
+    },
+    /// Pull a cover off.
+    Pull {
+        /// Number of the task.
+        task: usize,
+        /// Number of the arm.
+        arm: usize,
+    },
+    /// Lay the cover aside.
+    LayAside {
+        /// Number of the task.
+        task: usize,
+        /// Number of the arm.
+        arm: usize,
+    },
+    /// Take the unit away.
+    Discharge {
+        /// Number of the unit.
+        unit: usize,
+        /// Number of the table.
+        table: usize,
+    },
+}
+
+/// What is to be begun now.
+#[derive(Clone, Debug, PartialEq, Eq, Hash)]
+pub struct Command {
+    /// Names it in its event; never used twice.
+    pub ticket: u32,
+    /// What to do.
+    pub work: Work,
+}
+
+/// What has ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum Event {
+    /// Begin: nothing has ended yet.
+    Begin,
+    /// Done as commanded.
+    Done(u32),
+    /// Ended, but not as it should: the screw is in, the cover on, the picture of no use.
+    Failed(u32),
+}
+
+/// How far a task is.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Hash)]
+struct Progress {
+    begun: bool,
+    /// It will not be begun any more.
+    dropped: bool,
+    /// The table is not needed any more.
+    table_free: bool,
+    /// Its result is there, or will not come.
+    known: bool,
+    /// The result is that it failed.
+    failed: bool,
+}
+
+/// What a task waits for in another one.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+enum Until {
+    TableFree,
+    Known,
+}
+
+/// Where an arm is.
+#[derive(Clone, Debug, PartialEq, Eq, Hash)]
+struct ArmState {
+    /// Task that it belongs to, until it is back at rest from it.
+    task: Option<usize>,
+    /// Across, in whole mm; `None` at rest.
+    at_mm: Option<i64>,
+    /// Screws to do for its task, with attempts so far.
+    left: VecDeque<(usize, u8)>,
+    /// In motion or at work.
+    busy: bool,
+}
+
+/// Executes a plan event by event. It is a value: clone it, compare it, try it out.
+#[derive(Clone, Debug, PartialEq, Eq, Hash)]
+pub struct Dispatcher {
+    tasks: Vec<Fixed>,
+    progress: Vec<Progress>,
+    arms: Vec<ArmState>,
+    /// Who holds each zone, from right to left.
+    zones: Vec<Option<usize>>,
+    /// Side that each table shows, and if it is turning.
+    tables: Vec<(Option<usize>, bool)>,
+    open: BTreeMap<u32, Work>,
+    next_ticket: u32,
+    retries: u8,
+    rest_mm: Vec<i64>,
+    half_clearance_mm: i64,
+    right_mm: i64,
+    left_in: Vec<(usize, usize)>,
+}
+
+/// What does not change about a task.
+#[derive(Clone, Debug, PartialEq, Eq, Hash)]
+struct Fixed {
+    kind: Kind,
+    unit: usize,
+    table: usize,
+    side: Option<usize>,
+    after: Vec<(usize, Until)>,
+    after_any: Vec<Vec<(usize, Until)>>,
+    /// Tasks that need something that it needs too, and whether they stand before it in the plan.
+    rivals: Vec<(usize, bool)>,
+    /// Screws by arm, and the places of all screws of the face across, mm.
+    screws: Vec<Vec<usize>>,
+    y_mm: Vec<i64>,
+    /// Arm that pulls, and the strip across that is swept, mm.
+    pull: Option<(usize, i64, i64)>,
+}
+
+impl Dispatcher {
+    /// A dispatcher for a plan of a problem.
+    ///
+    /// # Arguments
+    /// * `retries` – how often a screw is tried again.
+    pub fn new(problem: &Problem, placed: &[Placed], retries: u8) -> Self {
+        let station: &Station = &problem.station;
+        let mut tasks: Vec<Option<Fixed>> = vec![None; problem.tasks.len()];
+        let (mut low_mm, mut high_mm) = (f64::INFINITY, f64::NEG_INFINITY);
+        for (k, p) in placed.iter().enumerate() {
+            let task = &problem.tasks[p.task];
+            let mode = &task.modes[p.mode];
+            for used in mode.arms.iter().flatten() {
+                low_mm = low_mm.min(used.strip.low_mm);
+                high_mm = high_mm.max(used.strip.high_mm);
+            }
+            let until = |after: &super::After| {
+                let is_look = matches!(problem.tasks[after.task].kind, Kind::Look | Kind::SecondLook);
+                let until = if is_look && after.lag_s > 0.0 {
+                    Until::Known
+                } else {
+                    Until::TableFree
+                };
+                (after.task, until)
+            };
+            let needs_same = |q: &Placed| {
+                let other = &problem.tasks[q.task];
+                let other_mode = &other.modes[q.mode];
+                let turned = task.side.is_some() && other.side.is_some() && task.side != other.side;
+                let at_table = task.unit == other.unit && (task.alone || other.alone || turned);
+                at_table
+                    || mode
+                        .arms
+                        .iter()
+                        .zip(&other_mode.arms)
+                        .any(|(a, b)| a.is_some() && b.is_some())
+            };
+            let middle_mm = station.tables_y_mm[task.table];
+            let pull = mode
+                .arms
+                .iter()
+                .position(Option::is_some)
+                .filter(|_| task.kind == Kind::Cover);
+            tasks[p.task] = Some(Fixed {
+                kind: task.kind,
+                unit: task.unit,
+                table: task.table,
+                side: task.side,
+                after: task.after.iter().map(until).collect(),
+                after_any: task
+                    .after_any
+                    .iter()
+                    .map(|way| way.iter().map(until).collect())
+                    .collect(),
+                rivals: placed
+                    .iter()
+                    .enumerate()
+                    .filter(|(n, q)| *n != k && needs_same(q))
+                    .map(|(n, q)| (q.task, n < k))
+                    .collect(),
+                screws: (0..station.arms.len())
+                    .map(|arm| mode.stops.iter().filter(|s| s.arm == arm).map(|s| s.screw).collect())
+                    .collect(),
+                y_mm: match task.kind {
+                    Kind::Screws => problem.product.faces[task.part].screws_mm.iter(),
+                    _ => [].iter(),
+                }
+                .map(|at| (middle_mm + at[0]).round() as i64)
+                .collect(),
+                pull: pull.map(|arm| {
+                    let half_mm = 0.5 * problem.product.covers[task.part].width_mm;
+                    (
+                        arm,
+                        (middle_mm - half_mm).floor() as i64,
+                        (middle_mm + half_mm).ceil() as i64,
+                    )
+                }),
+            });
+        }
+        let half_mm = 0.5 * station.clearance_mm;
+        let (low_mm, high_mm) = (low_mm - half_mm - ZONE_MM, high_mm + half_mm + ZONE_MM);
+        let zones = if low_mm < high_mm {
+            ((high_mm - low_mm) / ZONE_MM).ceil() as usize + 1
+        } else {
+            1
+        };
+        let tasks: Vec<Fixed> = tasks.into_iter().flatten().collect();
+        Self {
+            progress: vec![Progress::default(); tasks.len()],
+            tasks,
+            arms: station
+                .arms
+                .iter()
+                .map(|_| ArmState {
+                    task: None,
+                    at_mm: None,
+                    left: VecDeque::new(),
+                    busy: false,
+                })
+                .collect(),
+            zones: vec![None; zones],
+            tables: vec![(None, false); station.tables_y_mm.len()],
+            open: BTreeMap::new(),
+            next_ticket: 1,
+            retries,
+            rest_mm: station.arms.iter().map(|arm| arm.rest_y_mm.round() as i64).collect(),
+            half_clearance_mm: half_mm.ceil() as i64,
+            right_mm: if low_mm.is_finite() { low_mm.floor() as i64 } else { 0 },
+            left_in: Vec::new(),
+        }
+    }
+
+    /// Takes note of an event and says what to begin. An event of an unknown ticket changes nothing.
+    pub fn step(&mut self, event: Event) -> Vec<Command> {
+        let mut commands = Vec::new();
+        if let Event::Done(ticket) | Event::Failed(ticket) = event {
+            let Some(work) = self.open.remove(&ticket) else {
+                return commands;
+            };
+            if let Some(next) = self.ended(&work, matches!(event, Event::Done(_))) {
+                self.begin(next, &mut commands);
+            }
+        }
+        // what begins may let something else begin or be dropped: until nothing changes
+        while self.advance(&mut commands) {}
+        commands
+    }
+
+    /// True if every task is over or dropped and nothing is under way.
+    pub fn is_finished(&self) -> bool {
+        let over = |p: &Progress| p.dropped || (p.table_free && p.known);
+        self.open.is_empty() && self.progress.iter().all(over)
+    }
+
+    /// What is under way.
+    pub fn open(&self) -> impl Iterator<Item = (u32, &Work)> {
+        self.open.iter().map(|(ticket, work)| (*ticket, work))
+    }
+
+    /// Screws that stayed in: number of the task and of the screw.
+    pub fn left_in(&self) -> &[(usize, usize)] {
+        &self.left_in
+    }
+
+    /// Tasks that were dropped, by number.
+    pub fn dropped(&self) -> impl Iterator<Item = usize> {
+        self.progress
+            .iter()
+            .enumerate()
+            .filter(|(_, p)| p.dropped)
+            .map(|(k, _)| k)
+    }
+
+    /// Takes note of what ended; returns what follows at once.
+    fn ended(&mut self, work: &Work, is_done: bool) -> Option<Work> {
+        match *work {
+            Work::Load { unit, table } => {
+                self.tables[table] = (is_done.then_some(0), false);
+                self.over(self.find(Kind::Load, unit), is_done);
+            }
+            Work::Discharge { unit, table } => {
+                self.tables[table] = (None, false);
+                self.over(self.find(Kind::Discharge, unit), is_done);
+            }
+            // a table that did not turn shows what nobody knows: it is turned again
+            Work::Turn { table, side } => self.tables[table] = (is_done.then_some(side), false),
+            Work::Picture { task } => {
+                self.progress[task].table_free = true;
+                if is_done {
+                    return Some(Work::Process { task });
+                }
+                self.over(Some(task), false);
+            }
+            Work::Process { task } => self.over(Some(task), is_done),
+            Work::Drive {
+                task,
+                arm,
+                screw,
+                attempt,
+            } => {
+                self.arms[arm].busy = false;
+                if !is_done {
+                    if attempt < self.retries {
+                        self.arms[arm].left.push_back((screw, attempt + 1));
+                    } else {
+                        self.left_in.push((task, screw));
+                        self.progress[task].failed = true;
+                    }
+                }
+            }
+            Work::Withdraw { arm } => {
+                self.free(arm);
+                self.arms[arm].busy = false;
+                self.arms[arm].at_mm = None;
+                if self.arms[arm].left.is_empty() {
+                    self.leave(arm);
+                }
+            }
+            Work::Pull { task, arm } => {
+                self.free(arm);
+                if is_done {
+                    self.progress[task].table_free = true;
+                    self.progress[task].known = true;
+                    return Some(Work::LayAside { task, arm });
+                }
+                self.arms[arm].busy = false;
+                self.leave(arm);
+                self.over(Some(task), false);
+            }
+            Work::LayAside { arm, .. } => {
+                self.arms[arm].busy = false;
+                self.leave(arm);
+            }
+        }
+        None
+    }
+
+    fn find(&self, kind: Kind, unit: usize) -> Option<usize> {
+        self.tasks.iter().position(|t| t.kind == kind && t.unit == unit)
+    }
+
+    fn over(&mut self, task: Option<usize>, is_done: bool) {
+        if let Some(task) = task {
+            let progress = &mut self.progress[task];
+            progress.table_free = true;
+            progress.known = true;
+            progress.failed |= !is_done;
+        }
+    }
+
+    /// An arm is done with its task; the last one ends the task.
+    fn leave(&mut self, arm: usize) {
+        let Some(task) = self.arms[arm].task.take() else { return };
+        if self.tasks[task].kind == Kind::Screws && !self.arms.iter().any(|other| other.task == Some(task)) {
+            let is_done = !self.progress[task].failed;
+            self.over(Some(task), is_done);
+        }
+    }
+
+    fn free(&mut self, arm: usize) {
+        for zone in &mut self.zones {
+            if *zone == Some(arm) {
+                *zone = None;
+            }
+        }
+    }
+
+    /// Takes everything from the arm's own side to the far end of a stretch, or nothing.
+    fn take(&mut self, arm: usize, low_mm: i64, high_mm: i64) -> bool {
+        let zone = |mm: i64| ((mm - self.right_mm).max(0) as usize / ZONE_MM as usize).min(self.zones.len() - 1);
+        let range = if arm == 0 {
+            0..=zone(high_mm + self.half_clearance_mm)
+        } else {
+            zone(low_mm - self.half_clearance_mm)..=self.zones.len() - 1
+        };
+        if self.zones[range.clone()]
+            .iter()
+            .any(|held| held.is_some_and(|by| by != arm))
+        {
+            return false;
+        }
+        self.free(arm);
+        for zone in &mut self.zones[range] {
+            *zone = Some(arm);
+        }
+        true
+    }
+
+    fn begin(&mut self, work: Work, commands: &mut Vec<Command>) {
+        commands.push(Command {
+            ticket: self.next_ticket,
+            work: work.clone(),
+        });
+        self.open.insert(self.next_ticket, work);
+        self.next_ticket += 1;
+    }
+
+    /// One pass over arms and tasks; true if something changed.
+    fn advance(&mut self, commands: &mut Vec<Command>) -> bool {
+        let mut changed = false;
+        for arm in 0..self.arms.len() {
+            changed |= self.move_arm(arm, commands);
+        }
+        for task in 0..self.tasks.len() {
+            if !self.progress[task].begun && !self.progress[task].dropped {
+                changed |= self.drop_if_hopeless(task) || self.begin_task(task, commands);
+            }
+        }
+        changed
+    }
+
+    /// The next screw of an arm at work, or the way back.
+    fn move_arm(&mut self, arm: usize, commands: &mut Vec<Command>) -> bool {
+        let Some(task) = self.arms[arm].task else { return false };
+        if self.arms[arm].busy || self.tasks[task].kind != Kind::Screws {
+            return false;
+        }
+        if let Some(&(screw, attempt)) = self.arms[arm].left.front() {
+            let to_mm = self.tasks[task].y_mm[screw];
+            let rest_mm = self.rest_mm[arm];
+            let from_mm = self.arms[arm].at_mm.unwrap_or(rest_mm);
+            // with the way back, so that it is always free
+            if self.take(arm, from_mm.min(to_mm).min(rest_mm), from_mm.max(to_mm).max(rest_mm)) {
+                self.arms[arm].left.pop_front();
+                self.arms[arm].at_mm = Some(to_mm);
+                self.arms[arm].busy = true;
+                self.begin(
+                    Work::Drive {
+                        task,
+                        arm,
+                        screw,
+                        attempt,
+                    },
+                    commands,
+                );
+                return true;
+            }
+        }
+        if self.arms[arm].at_mm.is_some() {
+            self.arms[arm].busy = true;
+            self.begin(Work::Withdraw { arm }, commands);
+            return true;
+        }
+        false
+    }
+
+    /// True where what a task waits for has come.
+    fn has_come(&self, (task, until): (usize, Until)) -> bool {
+        let p = &self.progress[task];
+        match until {
+            Until::TableFree => p.table_free,
+            Until::Known => p.known,
+        }
+    }
+
+    /// True where what a task needs will never come.
+    fn is_lost(&self, (task, _): (usize, Until)) -> bool {
+        let p = &self.progress[task];
+        p.dropped || (p.known && p.failed)
+    }
+
+    /// Drops a task whose preconditions cannot come any more.
+    fn drop_if_hopeless(&mut self, task: usize) -> bool {
+        let fixed = &self.tasks[task];
+        let is_hopeless = match fixed.kind {
+            // a unit that was loaded is taken away, whatever happened to it; a table whose unit stayed on it takes no other
+            Kind::Discharge => self
+                .find(Kind::Load, fixed.unit)
+                .is_some_and(|load| self.is_lost((load, Until::Known))),
+            // a face is looked at again even if a screw stayed: the picture is the record
+            Kind::SecondLook => fixed.after.iter().any(|(before, _)| self.progress[*before].dropped),
+            _ => {
+                let any = &fixed.after_any;
+                fixed.after.iter().any(|a| self.is_lost(*a))
+                    || fixed.after.iter().any(|a| self.has_screws_in(a.0))
+                    || (!any.is_empty()
+                        && any
+                            .iter()
+                            .all(|way| way.iter().any(|a| self.is_lost(*a) || self.has_screws_in(a.0))))
+            }
+        };
+        if is_hopeless {
+            self.progress[task].dropped = true;
+        }
+        is_hopeless
+    }
+
+    /// True for a second look at a face with a screw that is known to be in.
+    fn has_screws_in(&self, task: usize) -> bool {
+        let fixed = &self.tasks[task];
+        fixed.kind == Kind::SecondLook
+            && fixed
+                .after
+                .iter()
+                .any(|(screws, _)| self.is_lost((*screws, Until::Known)))
+    }
+
+    /// True for a task that was planned after an alternative which is lost: others need not wait for it, as it may wait for them.
+    fn is_put_back(&self, task: usize) -> bool {
+        let any = &self.tasks[task].after_any;
+        any.iter()
+            .any(|way| way.iter().any(|a| self.is_lost(*a) || self.has_screws_in(a.0)))
+    }
+
+    fn begin_task(&mut self, task: usize, commands: &mut Vec<Command>) -> bool {
+        let fixed = &self.tasks[task];
+        let (unit, table, side) = (fixed.unit, fixed.table, fixed.side);
+        let is_gone = |k: usize| self.progress[k].dropped;
+        let ready = |a: &(usize, Until)| is_gone(a.0) || self.has_come(*a);
+        let in_turn = |&(rival, is_before): &(usize, bool)| {
+            let p = &self.progress[rival];
+            p.dropped || p.table_free || (!p.begun && (!is_before || self.is_put_back(rival)))
+        };
+        let any = fixed.after_any.is_empty()
+            || fixed
+                .after_any
+                .iter()
+                .any(|way| way.iter().all(|a| self.has_come(*a) && !self.is_lost(*a)));
+        if !(fixed.after.iter().all(ready) && fixed.rivals.iter().all(in_turn) && any) {
+            return false;
+        }
+        if let Some(side) = side {
+            let (shown, turning) = self.tables[table];
+            if turning {
+                return false;
+            }
+            if shown != Some(side) {
+                self.tables[table].1 = true;
+                self.begin(Work::Turn { table, side }, commands);
+                return true;
+            }
+        }
+        match fixed.kind {
+            Kind::Load => self.begin(Work::Load { unit, table }, commands),
+            Kind::Discharge => self.begin(Work::Discharge { unit, table }, commands),
+            Kind::Look | Kind::SecondLook => self.begin(Work::Picture { task }, commands),
+            Kind::Screws => {
+                let screws = fixed.screws.clone();
+                if (0..self.arms.len()).any(|arm| !screws[arm].is_empty() && self.arms[arm].task.is_some()) {
+                    return false;
+                }
+                for (arm, screws) in screws.into_iter().enumerate().filter(|(_, screws)| !screws.is_empty()) {
+                    self.arms[arm].task = Some(task);
+                    self.arms[arm].left = screws.into_iter().map(|screw| (screw, 0)).collect();
+                }
+            }
+            Kind::Cover => {
+                let Some((arm, low_mm, high_mm)) = fixed.pull else {
+                    return false;
+                };
+                let rest_mm = self.rest_mm[arm];
+                if self.arms[arm].task.is_some() || !self.take(arm, low_mm.min(rest_mm), high_mm.max(rest_mm)) {
+                    return false;
+                }
+                self.arms[arm].task = Some(task);
+                self.arms[arm].busy = true;
+                self.begin(Work::Pull { task, arm }, commands);
+            }
+        }
+        self.progress[task].begun = true;
+        true
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::schedule::{Limits, Product, solve};
+    use stateright::{Checker, Model, Property};
+
+    const SMALL: &str = r#"
+        product = "small"
+        loaded = "front"
+        [[faces]]
+        name = "front"
+        side = "front"
+        screws_mm = [[-350, 300], [60, 300], [350, 300]]
+        [[faces]]
+        name = "inner"
+        side = "front"
+        screws_mm = [[-200, 500], [300, 500]]
+        after_covers = ["lid"]
+        [[covers]]
+        name = "lid"
+        side = "top"
+        width_mm = 800
+        held_by = ["front"]
+        [[covers]]
+        name = "back"
+        side = "front"
+        width_mm = 800
+        requires_any = [{ covers = ["lid"] }, { faces = ["front"] }]
+    "#;
+
+    fn problem(text: &str, arms: usize, tables: usize, units: usize) -> (Problem, Vec<Placed>) {
+        let product = Product::parse(text, "small.toml").expect("product");
+        let station = Station::new(arms, tables).expect("station");
+        let problem = Problem::new(&product, &station, units).expect("problem");
+        let limits = Limits {
+            rounds: 3,
+            steps: 2000,
+            ..Limits::default()
+        };
+        let plan = solve(&problem, &limits, |_| {});
+        problem.check(&plan.placed).expect("valid");
+        (problem, plan.placed)
+    }
+
+    /// A dispatcher and the world that it sees: where each arm comes from and goes to.
+    #[derive(Clone, Debug, PartialEq, Eq, Hash)]
+    struct Cell {
+        dispatcher: Dispatcher,
+        sweeps_mm: Vec<Option<(i64, i64)>>,
+        begun: Vec<Work>,
+        repeated: bool,
+        meets: bool,
+    }
+
+    impl Cell {
+        fn told(&mut self, event: Event, clearance_mm: i64) {
+            let before: Vec<Option<i64>> = self.dispatcher.arms.iter().map(|arm| arm.at_mm).collect();
+            let commands = self.dispatcher.step(event);
+            let under_way: Vec<usize> = self.dispatcher.open.values().filter_map(arm_of).collect();
+            for (arm, sweep) in self.sweeps_mm.iter_mut().enumerate() {
+                let at_rest = !under_way.contains(&arm) && self.dispatcher.arms[arm].at_mm.is_none();
+                if at_rest
+                    || self
+                        .dispatcher
+                        .open
+                        .values()
+                        .any(|w| matches!(w, Work::LayAside { arm: a, .. } if *a == arm))
+                {
+                    *sweep = None;
+                }
+            }
+            for command in commands {
+                let d = &self.dispatcher;
+                let over = |places: [i64; 2]| Some((places[0].min(places[1]), places[0].max(places[1])));
+                match command.work {
+                    Work::Drive { task, arm, screw, .. } => {
+                        let from = before[arm].unwrap_or(d.rest_mm[arm]);
+                        self.sweeps_mm[arm] = over([from, d.tasks[task].y_mm[screw]]);
+                    }
+                    Work::Withdraw { arm } => {
+                        let from = d.arms[arm].at_mm.unwrap_or(d.rest_mm[arm]);
+                        self.sweeps_mm[arm] = over([from, d.rest_mm[arm]]);
+                    }
+                    Work::Pull { task, arm } => {
+                        let (_, low, high) = d.tasks[task].pull.expect("a cover");
+                        self.sweeps_mm[arm] = Some((low.min(d.rest_mm[arm]), high.max(d.rest_mm[arm])));
+                    }
+                    _ => {}
+                }
+                if !matches!(command.work, Work::Withdraw { .. } | Work::Turn { .. }) {
+                    self.repeated |= self.begun.contains(&command.work);
+                    self.begun.push(command.work);
+                    self.begun.sort();
+                }
+            }
+            if let [Some((_, right)), Some((left, _))] = self.sweeps_mm[..] {
+                self.meets |= right + clearance_mm > left;
+            }
+        }
+    }
+
+    fn arm_of(work: &Work) -> Option<usize> {
+        match work {
+            Work::Drive { arm, .. } | Work::Withdraw { arm } | Work::Pull { arm, .. } | Work::LayAside { arm, .. } => {
+                Some(*arm)
+            }
+            _ => None,
+        }
+    }
+
+    /// Every order in which events can come, and every failure; a turn that fails would be tried for ever.
+    struct AllOrders {
+        dispatcher: Dispatcher,
+        clearance_mm: i64,
+    }
+
+    impl Model for AllOrders {
+        type State = Cell;
+        type Action = Event;
+
+        fn init_states(&self) -> Vec<Cell> {
+            let mut cell = Cell {
+                sweeps_mm: vec![None; self.dispatcher.arms.len()],
+                dispatcher: self.dispatcher.clone(),
+                begun: Vec::new(),
+                repeated: false,
+                meets: false,
+            };
+            cell.told(Event::Begin, self.clearance_mm);
+            vec![cell]
+        }
+
+        fn actions(&self, cell: &Cell, actions: &mut Vec<Event>) {
+            for (ticket, work) in cell.dispatcher.open() {
+                actions.push(Event::Done(ticket));
+                if !matches!(work, Work::Turn { .. } | Work::Withdraw { .. } | Work::LayAside { .. }) {
+                    actions.push(Event::Failed(ticket));
+                }
+            }
+        }
+
+        fn next_state(&self, cell: &Cell, event: Event) -> Option<Cell> {
+            let mut next = cell.clone();
+            next.told(event, self.clearance_mm);
+            Some(next)
+        }
+
+        fn properties(&self) -> Vec<Property<Self>> {
+            vec![
+                Property::always("arms keep their distance", |_, cell: &Cell| !cell.meets),
+                Property::always("nothing is begun twice", |_, cell: &Cell| !cell.repeated),
+                Property::always("something is under way, or all is over", |_, cell: &Cell| {
+                    cell.dispatcher.open.is_empty() == cell.dispatcher.is_finished()
+                }),
+                Property::sometimes("everything comes off", |_, cell: &Cell| {
+                    cell.dispatcher.is_finished() && cell.dispatcher.dropped().next().is_none()
+                }),
+                Property::sometimes("a screw stays", |_, cell: &Cell| !cell.dispatcher.left_in().is_empty()),
+            ]
+        }
+    }
+
+    fn check_all(text: &str, arms: usize, tables: usize, units: usize, retries: u8) -> usize {
+        let (problem, placed) = problem(text, arms, tables, units);
+        let model = AllOrders {
+            dispatcher: Dispatcher::new(&problem, &placed, retries),
+            clearance_mm: problem.station.clearance_mm as i64,
+        };
+        let checker = model.checker().threads(2).spawn_bfs().join();
+        checker.assert_properties();
+        checker.unique_state_count()
+    }
+
+    #[test]
+    fn no_order_of_events_and_no_failure_leads_astray() {
+        let states = check_all(SMALL, 2, 1, 1, 1);
+        assert!(states > 1000, "{states} states");
+        check_all(SMALL, 1, 1, 1, 1);
+    }
+
+    /// Two tables with one face each, so that the arms cross between them if they are let.
+    #[test]
+    fn two_tables_neither() {
+        let text = r#"
+            product = "plate"
+            loaded = "front"
+            [[faces]]
+            name = "front"
+            side = "front"
+            screws_mm = [[-350, 300], [0, 300], [350, 300]]
+        "#;
+        let states = check_all(text, 2, 2, 2, 0);
+        assert!(states > 100, "{states} states");
+    }
+
+    /// The shipped unit with events in the order of planned times; one screw never comes out.
+    #[test]
+    fn a_screw_that_stays_keeps_its_covers() {
+        let product = Product::outdoor_unit().expect("built-in");
+        let problem = Problem::new(&product, &Station::new(2, 1).expect("station"), 1).expect("problem");
+        let plan = solve(
+            &problem,
+            &Limits {
+                rounds: 2,
+                ..Limits::default()
+            },
+            |_| {},
+        );
+        let run = |stuck: Option<(usize, usize)>| {
+            let mut dispatcher = Dispatcher::new(&problem, &plan.placed, 2);
+            let mut commands: VecDeque<Command> = dispatcher.step(Event::Begin).into();
+            let mut count = 0;
+            while let Some(command) = commands.pop_front() {
+                let fails = matches!(command.work, Work::Drive { task, screw, .. } if stuck == Some((task, screw)));
+                count += usize::from(fails);
+                let event = if fails {
+                    Event::Failed(command.ticket)
+                } else {
+                    Event::Done(command.ticket)
+                };
+                commands.extend(dispatcher.step(event));
+            }
+            assert!(dispatcher.is_finished());
+            (dispatcher, count)
+        };
+        let (all, _) = run(None);
+        assert_eq!(all.dropped().count(), 0);
+        let right = problem
+            .tasks
+            .iter()
+            .position(|t| t.name == "1 right screws")
+            .expect("task");
+        let (stuck, attempts) = run(Some((right, 3)));
+        assert_eq!(attempts, 3);
+        assert_eq!(stuck.left_in(), [(right, 3)]);
+        let dropped: Vec<&str> = stuck.dropped().map(|k| problem.tasks[k].name.as_str()).collect();
+        assert!(
+            dropped.contains(&"1 top cover") && dropped.contains(&"1 right cover"),
+            "{dropped:?}"
+        );
+        assert!(!dropped.contains(&"1 discharge"), "{dropped:?}");
+    }
+}
