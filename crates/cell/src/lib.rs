@@ -29,22 +29,30 @@
 //! # Ok::<(), cell::program::ProgramError>(())
 //! ```
 
+pub mod basis;
 pub mod calibrate;
 pub mod capture;
 pub mod config;
 pub mod device;
+pub mod digest;
 pub mod forecast;
+pub mod frames;
 pub mod journal;
+pub mod look;
 pub mod plan;
 pub mod program;
 pub mod record;
 pub mod removal;
+pub mod replay;
 pub mod run;
+pub mod seal;
 pub mod statistics;
+pub mod store;
 
 pub use calibrate::{CaptureSettings, CaptureSummary, capture_pairs};
 pub use config::CellConfig;
 pub use device::Devices;
+pub use digest::Digest;
 pub use journal::Journal;
 pub use program::Program;
 pub use record::{Outcome, UnitRecord};

@@ -94,6 +94,10 @@ impl SafeTarget {
     pub fn approach(&self) -> Direction<Base> {
         self.approach
     }
+    /// Where the straight way to it begins, mm before it.
+    pub fn standoff_mm(&self) -> f64 {
+        self.standoff_mm
+    }
     /// Pose of the tool with the bit in the screw.
     pub fn contact_pose(&self) -> Transform<Base, Tool> {
         tool_pose(self.tip, self.approach)

@@ -1,5 +1,6 @@
 //! Rates with their bounds, and times by resource: what a number of units says.
 
+use crate::digest::Digest;
 use crate::record::{Outcome, Times, UnitRecord};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -44,12 +45,19 @@ pub struct Statistics {
 impl Statistics {
     /// Over finished units; those under way are left out.
     pub fn over(records: &[UnitRecord]) -> Self {
+        Self::of(&records.iter().map(Digest::of).collect::<Vec<_>>())
+    }
+
+    /// The same over units as they are counted.
+    pub fn of(records: &[Digest]) -> Self {
         let mut causes = BTreeMap::new();
         let (mut ok, mut ng, mut excluded, mut after) = (Vec::new(), Vec::new(), 0, 0);
-        let mut attempts = Vec::new();
+        let (mut attempted, mut removed, mut retried) = (0, 0, 0);
         for record in records {
             let Some(outcome) = &record.outcome else { continue };
-            attempts.extend(record.attempts());
+            attempted += record.attempted;
+            removed += record.removed;
+            retried += record.retried;
             let cause = match outcome {
                 Outcome::Ok => {
                     ok.push(record);
@@ -71,7 +79,7 @@ impl Statistics {
             };
             *causes.entry(cause).or_default() += 1;
         }
-        let in_scope: Vec<&UnitRecord> = ok.iter().chain(&ng).copied().collect();
+        let in_scope: Vec<&Digest> = ok.iter().chain(&ng).copied().collect();
         let units = in_scope.len() + excluded;
         let mut times_mean = Times::default();
         for record in &in_scope {
@@ -95,15 +103,15 @@ impl Statistics {
             cycle_ok_mean_s: mean_cycle_s(&ok),
             cycle_ng_mean_s: mean_cycle_s(&ng),
             times_mean,
-            screws_attempted: attempts.len(),
-            screws_removed: Rate::of(attempts.iter().filter(|a| a.removed()).count(), attempts.len()),
-            screws_retried: attempts.iter().filter(|a| a.retries() > 0).count(),
+            screws_attempted: attempted,
+            screws_removed: Rate::of(removed, attempted),
+            screws_retried: retried,
             causes,
         }
     }
 }
 
-fn mean_cycle_s(records: &[&UnitRecord]) -> Option<f64> {
+fn mean_cycle_s(records: &[&Digest]) -> Option<f64> {
     (!records.is_empty()).then(|| records.iter().map(|r| r.times.cycle_s()).sum::<f64>() / records.len() as f64)
 }
 

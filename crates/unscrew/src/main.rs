@@ -13,6 +13,7 @@ mod diagnosis;
 mod evaluate;
 mod model;
 mod output;
+mod replay;
 mod report;
 mod run;
 mod simulate;
@@ -56,6 +57,8 @@ enum Command {
     Synth(synth::Args),
     /// What a cell would do with thousands of units: completion, time, people, cells for a year's volume.
     Simulate(simulate::Args),
+    /// Decide a recorded shift again, with the same or another model, map or cell file, and say what would have changed.
+    Replay(replay::Args),
     /// Rates with bounds and times by resource, from a run's journal.
     Stats(stats::Args),
 }
@@ -84,6 +87,7 @@ fn main() -> ExitCode {
         Command::Model(command) => model::run(&command),
         Command::Synth(args) => synth::run(&args),
         Command::Simulate(args) => simulate::run(&args),
+        Command::Replay(args) => replay::run(&args),
         Command::Stats(args) => stats::run(&args),
     };
     match result {
