@@ -272,11 +272,16 @@ impl Default for Timeouts {
 pub struct JournalConfig {
     /// Quality of the kept pictures, 1 to 100.
     pub jpeg_quality: u8,
+    /// Keep every frame that was decided on without loss, so that `unscrew replay` can decide again.
+    pub keep_frames: bool,
 }
 
 impl Default for JournalConfig {
     fn default() -> Self {
-        Self { jpeg_quality: 88 }
+        Self {
+            jpeg_quality: 88,
+            keep_frames: false,
+        }
     }
 }
 

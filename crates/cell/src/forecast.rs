@@ -4,7 +4,8 @@
 //! the counts leave open (Beta, Jeffreys), so that the interval around a result holds what is not known beside what is chance.
 
 use crate::device::DriveEnd;
-use crate::record::{LeftAlone, NgReason, Outcome, Purpose, UnitRecord};
+use crate::digest::Digest;
+use crate::record::{NgReason, Outcome, Purpose, UnitRecord};
 use rand::{RngExt, SeedableRng};
 use rand_distr::{Beta, Distribution, Poisson};
 use rand_pcg::Pcg64Mcg;
@@ -669,27 +670,21 @@ pub struct Prediction {
 
 /// Predictions for the finished units in scope: every find that was acted on comes out, and no find that was left alone in doubt
 /// holds a cover.
-pub fn predictions(a: &Assumptions, records: &[UnitRecord]) -> Vec<Prediction> {
-    let in_scope = records.iter().filter_map(|r| match r.outcome.as_ref()? {
-        Outcome::Ok => Some((r, true)),
-        Outcome::Ng { .. } => Some((r, false)),
+pub fn predictions(a: &Assumptions, units: &[Digest]) -> Vec<Prediction> {
+    let in_scope = units.iter().filter_map(|unit| match unit.outcome.as_ref()? {
+        Outcome::Ok => Some((unit, true)),
+        Outcome::Ng { .. } => Some((unit, false)),
         Outcome::Excluded { .. } => None,
     });
     in_scope
-        .map(|(record, finished)| {
-            let found = || {
-                let looks = record.faces.iter().filter(|f| f.purpose == Purpose::Work);
-                looks.flat_map(|f| &f.found)
-            };
-            let acted_on = found().filter(|f| f.left_alone.is_none()).map(|f| f.score);
-            let in_doubt = found()
-                .filter(|f| f.left_alone == Some(LeftAlone::Review))
-                .map(|f| f.score);
-            Prediction {
-                unit: record.unit,
-                predicted: unaided(a, acted_on, in_doubt),
-                finished,
-            }
+        .map(|(unit, finished)| Prediction {
+            unit: unit.unit,
+            predicted: unaided(
+                a,
+                unit.scores_acted_on.iter().copied(),
+                unit.scores_in_doubt.iter().copied(),
+            ),
+            finished,
         })
         .collect()
 }

@@ -30,13 +30,17 @@
 //! # Ok::<(), cell::program::ProgramError>(())
 //! ```
 
+pub mod basis;
 pub mod calibrate;
 pub mod capture;
 pub mod config;
 pub mod device;
+pub mod digest;
 pub mod forecast;
+pub mod frames;
 pub mod journal;
 pub mod ladder;
+pub mod look;
 pub mod motion;
 pub mod packml;
 pub mod plan;
@@ -44,13 +48,17 @@ pub mod policy;
 pub mod program;
 pub mod record;
 pub mod removal;
+pub mod replay;
 pub mod run;
 pub mod schedule;
+pub mod seal;
 pub mod statistics;
+pub mod store;
 
 pub use calibrate::{CaptureSettings, CaptureSummary, capture_pairs};
 pub use config::CellConfig;
 pub use device::Devices;
+pub use digest::Digest;
 pub use journal::Journal;
 pub use program::Program;
 pub use record::{Outcome, UnitRecord};

@@ -116,6 +116,10 @@ impl SafeTarget {
     pub fn approach(&self) -> Direction<Base> {
         self.approach
     }
+    /// Where the straight way to it begins, mm before it.
+    pub fn standoff_mm(&self) -> f64 {
+        self.standoff_mm
+    }
     /// Pose of the tool with the bit in the screw.
     pub fn contact_pose(&self) -> Transform<Base, Tool> {
         tool_pose(self.tip, self.approach)
@@ -161,6 +165,18 @@ pub struct Reach<'a> {
     pub motion: &'a ArmMotion,
     /// Where its joints are now, rad.
     pub joints_rad: [f64; 6],
+}
+
+impl<'a> Reach<'a> {
+    /// An arm at rest.
+    pub fn from_rest(arm: usize, map: &'a Map, motion: &'a ArmMotion) -> Self {
+        Self {
+            arm,
+            map,
+            motion,
+            joints_rad: motion.home_rad(),
+        }
+    }
 }
 
 /// Why an arm is not sent to a find.

@@ -66,7 +66,7 @@ pub enum Choice {
 
 /// A choice with its reason.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Decision {
+pub struct Ruling {
     /// What.
     pub choice: Choice,
     /// Why, in words.
@@ -97,9 +97,9 @@ impl Destructive {
     ///
     /// # Arguments
     /// * `place` – where the screw is, for the path.
-    pub fn choose(&self, case: &Case<'_>, place: &SafeTarget) -> Decision {
+    pub fn choose(&self, case: &Case<'_>, place: &SafeTarget) -> Ruling {
         if case.can_retry {
-            return Decision {
+            return Ruling {
                 choice: Choice::Retry,
                 because: "something that does no harm is left to try".into(),
                 path: Vec::new(),
@@ -115,7 +115,7 @@ impl Destructive {
                 return without_milling(Choice::Person, because);
             }
             let (tip, axis) = (place.tip(), place.approach());
-            return Decision {
+            return Ruling {
                 choice: Choice::Mill,
                 because: format!(
                     "nothing harmless is left, {:.0} mm are free behind the {}, and the controller permits it",
@@ -158,8 +158,8 @@ impl Destructive {
     }
 }
 
-fn without_milling(choice: Choice, because: String) -> Decision {
-    Decision {
+fn without_milling(choice: Choice, because: String) -> Ruling {
+    Ruling {
         choice,
         because,
         path: Vec::new(),

@@ -4,7 +4,9 @@
 //! is what the program knows.
 
 use crate::device::{Bit, DriveEnd, DriveProgram};
-use crate::policy::Decision;
+use crate::frames::KeptFrame;
+use crate::look::{Decision, SecondLook};
+use crate::policy::Ruling;
 use crate::program::FaceId;
 use geometry::{Base, Camera, Point};
 use serde::{Deserialize, Serialize};
@@ -136,7 +138,7 @@ pub struct ScrewAttempt {
     pub still_there: Option<bool>,
     /// What was chosen when nothing harmless was left, and why.
     #[serde(default)]
-    pub decision: Option<Decision>,
+    pub decision: Option<Ruling>,
 }
 
 impl ScrewAttempt {
@@ -470,6 +472,12 @@ pub enum Event {
     Seen {
         /// What was found.
         face: Box<FaceRecord>,
+        /// What followed from it.
+        #[serde(default)]
+        decision: Option<Box<Decision>>,
+        /// What was decided on, if frames are kept.
+        #[serde(default)]
+        frame: Option<Box<KeptFrame>>,
     },
     /// A burst ended.
     Driven {
@@ -486,6 +494,12 @@ pub enum Event {
         screws: Vec<(usize, bool)>,
         /// The pictures.
         pictures: Vec<PictureId>,
+        /// What was decided on, if frames are kept.
+        #[serde(default)]
+        frames: Vec<KeptFrame>,
+        /// What followed, where this was a second look before another burst.
+        #[serde(default)]
+        second_look: Option<Box<SecondLook>>,
     },
     /// A person was asked to click on screws in a picture.
     Asked {
@@ -501,12 +515,15 @@ pub enum Event {
         /// Number in [`FaceRecord::found`].
         found: usize,
         /// What, why, and where a cutter would go.
-        decision: Decision,
+        decision: Ruling,
     },
     /// A pull ended.
     Pulled {
         /// How.
         cover: CoverRecord,
+        /// What was decided on, where a picture had to tell and frames are kept.
+        #[serde(default)]
+        frame: Option<Box<KeptFrame>>,
     },
     /// The gripper has laid its cover aside.
     LaidAside,
@@ -671,7 +688,7 @@ impl UnitRecord {
             Event::Intent { act } => self.open = Some(act.clone()),
             Event::Presented { .. } => self.open = None,
             // A look at the world answers whatever was in doubt about it; what it showed is in the record that comes with it.
-            Event::Seen { face } => {
+            Event::Seen { face, .. } => {
                 self.faces.push((**face).clone());
                 self.open = None;
             }
@@ -709,7 +726,7 @@ impl UnitRecord {
                     }
                 }
             }
-            Event::Verified { screws, pictures } => {
+            Event::Verified { screws, pictures, .. } => {
                 self.looks.extend(pictures.iter().cloned());
                 if let Some(face) = self.faces.last_mut() {
                     for (found, stands) in screws {
@@ -719,7 +736,7 @@ impl UnitRecord {
                     }
                 }
             }
-            Event::Pulled { cover } => {
+            Event::Pulled { cover, .. } => {
                 self.open = None;
                 self.covers.push(cover.clone());
             }
@@ -793,6 +810,23 @@ mod tests {
         })
     }
 
+    fn seen() -> Event {
+        Event::Seen {
+            face: face(),
+            decision: None,
+            frame: None,
+        }
+    }
+
+    fn verified(stands: bool) -> Event {
+        Event::Verified {
+            screws: vec![(0, stands)],
+            pictures: vec![],
+            frames: vec![],
+            second_look: None,
+        }
+    }
+
     #[test]
     fn times_add_up_to_the_clock_and_go_where_they_belong() {
         let events = [
@@ -804,7 +838,7 @@ mod tests {
                 },
             ),
             (15.0, Event::Presented { face: "front".into() }),
-            (17.0, Event::Seen { face: face() }),
+            (17.0, seen()),
             (
                 21.0,
                 Event::Driven {
@@ -823,13 +857,7 @@ mod tests {
                 },
             ),
             (24.0, Event::Recovery { on: false }),
-            (
-                25.0,
-                Event::Verified {
-                    screws: vec![(0, false)],
-                    pictures: vec![],
-                },
-            ),
+            (25.0, verified(false)),
             (28.0, Event::Discharged),
         ];
         let record = UnitRecord::from_events(1, 4.0, &events);
@@ -855,7 +883,7 @@ mod tests {
     #[test]
     fn a_picture_outweighs_the_driver() {
         let mut record = UnitRecord::new(1, 0.0);
-        record.apply(0.0, &Event::Seen { face: face() });
+        record.apply(0.0, &seen());
         record.apply(
             1.0,
             &Event::Driven {
@@ -865,13 +893,7 @@ mod tests {
             },
         );
         assert_eq!(record.screws_out(), 1);
-        record.apply(
-            2.0,
-            &Event::Verified {
-                screws: vec![(0, true)],
-                pictures: vec![],
-            },
-        );
+        record.apply(2.0, &verified(true));
         assert_eq!(record.screws_out(), 0);
         // the bit finds nothing there: what the picture took for a screw was its hole
         record.apply(
@@ -900,7 +922,7 @@ mod tests {
             takes_along: vec!["left".into()],
             time_s: 0.0,
         };
-        record.apply(6.0, &Event::Pulled { cover });
+        record.apply(6.0, &Event::Pulled { cover, frame: None });
         assert_eq!(record.open, None);
         assert_eq!(record.covers_off(), ["front", "left"]);
     }

@@ -5,18 +5,20 @@
 
 mod climb;
 
-use crate::capture::{FaceFit, Shot, present, region_around, regions_around, sheet_depth_mm, shoot};
+use crate::capture::{Shot, present, region_around, regions_around, shoot};
 use crate::config::CellConfig;
 use crate::device::{DeviceError, Devices, DriveEnd, DriveProgram, TagValue, jobs, tags};
+use crate::frames::KeptFrame;
 use crate::journal::{Journal, JournalError};
 use crate::ladder::Cause;
+use crate::look::{self, Judge, Question};
 use crate::motion::ArmMotion;
 use crate::packml::{Command, Illegal, Machine, State};
 use crate::plan::{self, Reach, SafeTarget, Target};
 use crate::program::{FaceId, Program, Step, Work};
 use crate::record::{
-    Act, CoverRecord, Event, ExclusionReason, FacePlane, FaceRecord, LeftAlone, NgReason, Outcome, PictureId, PullEnd,
-    Purpose, ScrewAttempt, SeenBy, UnitRecord, Verdict,
+    Act, CoverRecord, Event, ExclusionReason, FaceRecord, LeftAlone, NgReason, Outcome, PictureId, PullEnd, Purpose,
+    ScrewAttempt, SeenBy, UnitRecord, Verdict,
 };
 use crate::removal::Mover;
 use calibration::Map;
@@ -26,8 +28,6 @@ use std::time::Duration;
 
 /// How often a held cell looks whether it may go on, s.
 const HELD_POLL_S: f64 = 0.1;
-/// A cover is off if the sheet around its screws lies this much deeper than before, mm.
-const COVER_OFF_MM: f64 = 15.0;
 
 /// Finds screws in a shot. [`vision::Detector`] does; tests have their own.
 pub trait Finder: Send + Sync {
@@ -317,10 +317,7 @@ impl Runner {
     /// [`RunError`].
     pub async fn resume_unit(&mut self, observer: &dyn Observer) -> Result<Option<UnitRecord>, RunError> {
         self.executing()?;
-        let Some(unit) = self.journal.unfinished()? else {
-            return Ok(None);
-        };
-        let Some(record) = self.journal.unit(unit)? else {
+        let Some(record) = self.journal.under_way()? else {
             return Ok(None);
         };
         let mut way = Way {
@@ -343,8 +340,7 @@ impl Runner {
                     },
                 })?;
             }
-            way.log(Event::Discharged)?;
-            return way.close().await.map(Some);
+            return way.close(Some(Event::Discharged)).await.map(Some);
         }
         way.finish().await.map(Some)
     }
@@ -420,7 +416,7 @@ impl Way<'_> {
         }
         if !self.record.discharged {
             match self.discharge().await {
-                Ok(()) => self.log(Event::Discharged)?,
+                Ok(()) => return self.close(Some(Event::Discharged)).await,
                 Err(Stop::Journal(error)) => return Err(error.into()),
                 Err(Stop::Halted(why)) => return Err(self.halted(why)),
                 Err(Stop::Device(source)) => {
@@ -432,7 +428,7 @@ impl Way<'_> {
                 Err(Stop::Decided(_)) => {}
             }
         }
-        self.close().await
+        self.close(None).await
     }
 
     fn halted(&self, why: String) -> RunError {
@@ -480,8 +476,16 @@ impl Way<'_> {
         }
     }
 
-    async fn close(self) -> Result<UnitRecord, RunError> {
-        self.runner.journal.finish_unit(&self.record)?;
+    /// Closes the record, with the event that ends it unless that is written already.
+    async fn close(mut self, last: Option<Event>) -> Result<UnitRecord, RunError> {
+        match last {
+            Some(event) => {
+                let t_s = self.now_s();
+                self.record.apply(t_s, &event);
+                self.runner.journal.close_unit(t_s, &event, &self.record)?;
+            }
+            None => self.runner.journal.finish_unit(&self.record)?,
+        }
         // the plant's own systems may be down: the journal has everything
         if let Ok(json) = serde_json::to_string(&self.record)
             && let Err(error) = self.runner.devices.plant.report(&json).await
@@ -549,11 +553,12 @@ impl Way<'_> {
             return Ok(());
         };
         let holding = self.runner.devices.io.read(tags::GRIPPER_HOLDING).await? == TagValue::Bool(true);
-        let (end, seen_by) = if holding {
-            (PullEnd::Off, SeenBy::Signal)
+        let (end, seen_by, frame) = if holding {
+            (PullEnd::Off, SeenBy::Signal, None)
         } else {
             self.turn(&step.present).await?;
-            (self.is_cover_off(&step.present).await?, SeenBy::Picture)
+            let (end, frame) = self.is_cover_off(&step.present).await?;
+            (end, SeenBy::Picture, frame.map(Box::new))
         };
         self.lay_aside().await?;
         self.log(Event::Pulled {
@@ -565,6 +570,7 @@ impl Way<'_> {
                 takes_along: takes_along.clone(),
                 time_s: 0.0,
             },
+            frame,
         })?;
         if end == PullEnd::Off {
             self.log(Event::StepDone { step: index })?;
@@ -573,24 +579,11 @@ impl Way<'_> {
     }
 
     /// Whether the face that stands before the camera is still there: the sheet around the places where its screws were.
-    async fn is_cover_off(&mut self, face: &FaceId) -> Result<PullEnd, Stop> {
+    async fn is_cover_off(&mut self, face: &FaceId) -> Result<(PullEnd, Option<KeptFrame>), Stop> {
         let config = self.runner.config.inspection;
         let shot = shoot(&self.runner.devices, None, config.depth_frames.max(1)).await?;
         let before = self.record.faces.iter().rev().find(|f| f.face == *face);
-        let places = before
-            .into_iter()
-            .flat_map(|f| &f.found)
-            .filter_map(|f| Some((f, f.camera_mm?.z_mm())));
-        let (mut there, mut gone) = (0, 0);
-        for (found, depth_mm) in places {
-            let pixel = Pixel::new(found.u_px, found.v_px);
-            match sheet_depth_mm(&shot.frame, pixel, found.diameter_px) {
-                Some(now_mm) if (now_mm - depth_mm).abs() < COVER_OFF_MM => there += 1,
-                _ => gone += 1,
-            }
-        }
-        // never measured before: pulling once more is bounded, leaving it on is not what was asked for
-        Ok(if gone > there { PullEnd::Off } else { PullEnd::Stuck })
+        Ok((look::cover_off(&shot.frame, before), self.keep(&shot)?))
     }
 
     /// Sends the arms out of the way of table and camera.
@@ -622,68 +615,40 @@ impl Way<'_> {
         self.turn(face).await?;
         let config = self.runner.config.clone();
         let shot = shoot(&self.runner.devices, None, config.inspection.depth_frames).await?;
-        let odds = self.odds(purpose);
-        let mut screws = self.runner.finder.find(&shot.frame, odds)?;
-        self.budget(&shot);
-        if purpose == Purpose::Clicked {
+        let clicks = if purpose == Purpose::Clicked {
             let text = format!("Which heads on the {face} are cross screws that still stand?");
-            screws = self.ask(&shot, screws, &text).await?;
-        }
-        let certain = screws
-            .iter()
-            .filter(|s| !plan::is_doubtful(s.fits, odds) || s.verdict == Verdict::Other);
-        let heads: Vec<(Pixel, f64)> = certain.map(|s| (s.pixel, s.diameter_px)).collect();
-        let fit = FaceFit::around(&shot.frame, &heads, config.inspection.working_depth_mm);
-        let before = self.record.faces.iter().rev().find(|f| f.face == *face);
-        let before = before.map_or(&[][..], |f| &f.found);
-        plan::bound_doubtful(&mut screws, odds, config.inspection.doubtful_max, before, fit.as_ref());
-        let (found, targets) = plan::plan(&screws, &shot, fit.as_ref(), &self.reaches().await?, &config);
-        let picture = self
-            .runner
-            .journal
-            .store_picture(&shot.frame.color, config.journal.jpeg_quality)?;
-        let heads = screws
-            .iter()
-            .filter(|s| s.verdict == Verdict::Screw)
-            .filter_map(|s| s.top_normal);
-        let plane = fit.as_ref().and_then(|fit| {
-            let heads_lean_rad = fit.lean_rad(heads);
-            fit.plane().map(|plane| FacePlane {
-                heads_lean_rad,
-                ..plane
-            })
-        });
-        let seen = FaceRecord {
-            step: index,
-            step_name: step.name.clone(),
-            face: face.clone(),
-            purpose,
-            t_s: shot.frame.t_s,
-            picture: Some(picture),
-            width_px: shot.frame.color.width(),
-            height_px: shot.frame.color.height(),
-            plane,
-            found,
-            attempts: Vec::new(),
-        };
-        // Excluded is what was out of scope before this face was touched. Once it has been, a failure is a failure.
-        let touched = self
-            .record
-            .faces
-            .iter()
-            .any(|f| f.face == *face && !f.attempts.is_empty());
-        let least = if purpose == Purpose::Work {
-            step.least_screws()
+            self.ask(&shot, &text).await?
         } else {
-            0
-        };
-        let excluded = if touched || matches!(purpose, Purpose::Missed | Purpose::Clicked) {
             None
-        } else {
-            plan::exclusion(&seen, least, &config)
         };
+        let question = Question {
+            index,
+            step,
+            face,
+            purpose,
+            so_far: &self.record,
+            clicks: clicks.as_deref(),
+        };
+        let judged = self.judge().face(&shot, &question)?;
+        self.budget(&shot);
+        let decision = Some(Box::new(judged.decision()));
+        let look::Judged {
+            face: mut seen,
+            targets,
+            excluded,
+        } = judged;
+        seen.picture = Some(
+            self.runner
+                .journal
+                .store_picture(&shot.frame.color, config.journal.jpeg_quality)?,
+        );
+        let frame = self.keep(&shot)?.map(Box::new);
         self.observer.seen(self.record.unit, &seen);
-        self.log(Event::Seen { face: Box::new(seen) })?;
+        self.log(Event::Seen {
+            face: Box::new(seen),
+            decision,
+            frame,
+        })?;
         match excluded {
             Some((reason, detail)) => Err(self.exclude(reason, detail)),
             None => Ok((shot, targets)),
@@ -698,37 +663,35 @@ impl Way<'_> {
         })
     }
 
-    /// The arms that can take screws out, as they stand now.
-    async fn reaches(&self) -> Result<Vec<Reach<'_>>, DeviceError> {
+    /// The arms that can take screws out, from their rest: there they stand whenever a picture is taken.
+    fn reaches(&self) -> Vec<Reach<'_>> {
         let runner = &self.runner;
-        let mut reaches = Vec::new();
         let arms = runner.devices.arms.iter().zip(&runner.maps).zip(&runner.motions);
-        for (arm, ((device, map), motion)) in arms.enumerate() {
-            if let (Some(_), Some(motion)) = (&device.driver, motion) {
-                let joints_rad = device.robot.state().await?.joints_rad;
-                reaches.push(Reach {
-                    arm,
-                    map,
-                    motion,
-                    joints_rad,
-                });
-            }
-        }
-        Ok(reaches)
+        arms.enumerate()
+            .filter(|(_, ((device, _), _))| device.driver.is_some())
+            .filter_map(|(arm, ((_, map), motion))| Some(Reach::from_rest(arm, map, motion.as_ref()?)))
+            .collect()
     }
 
-    /// How much likelier than pictures say a doubtful head is a screw: a cover that does not come off is evidence.
-    fn odds(&self, purpose: Purpose) -> f64 {
-        match purpose {
-            Purpose::Missed => self.runner.config.inspection.stuck_cover_odds,
-            Purpose::Survey | Purpose::Work | Purpose::Clicked => 1.0,
+    /// What decides on the pictures of this cell.
+    fn judge(&self) -> Judge<'_> {
+        Judge {
+            finder: self.runner.finder.as_ref(),
+            reaches: self.reaches(),
+            config: &self.runner.config,
         }
     }
 
-    /// The same for the face that is being worked on.
+    /// Keeps what was decided on, if frames are kept.
+    fn keep(&self, shot: &Shot) -> Result<Option<KeptFrame>, JournalError> {
+        let keeps = self.runner.config.journal.keep_frames;
+        keeps.then(|| self.runner.journal.keep_frame(shot)).transpose()
+    }
+
+    /// How much likelier than pictures say a doubtful head on the face that is being worked on is a screw.
     fn face_odds(&self) -> f64 {
         let purpose = self.record.faces.last().map(|f| f.purpose);
-        purpose.map_or(1.0, |purpose| self.odds(purpose))
+        purpose.map_or(1.0, |purpose| look::odds(&self.runner.config, purpose))
     }
 
     /// True if a find of the face that is being worked on is a target only because its cover did not come off.
@@ -839,42 +802,35 @@ impl Way<'_> {
             config.inspection.depth_frames.max(1),
         )
         .await?;
-        let mut screws = self.runner.finder.find(&near.frame, self.face_odds())?;
+        let clicks = if asks {
+            self.ask(&near, "Where is the screw that the bit does not meet?")
+                .await?
+        } else {
+            None
+        };
+        let place = (center, half_px);
+        let (stands, place) = self
+            .judge()
+            .second_look(&near, place, self.face_odds(), clicks.as_deref())?;
         self.budget(&near);
-        if asks {
-            screws = self
-                .ask(&near, screws, "Where is the screw that the bit does not meet?")
-                .await?;
-        }
         let picture = self
             .runner
             .journal
             .store_picture(&near.frame.color, config.journal.jpeg_quality)?;
-        let same_px = config.inspection.same_screw_mm * half_px / config.inspection.second_look_mm;
-        let closest = screws
-            .into_iter()
-            .filter(|s| s.verdict == Verdict::Screw && near.to_whole(s.pixel).distance_px(&center) <= same_px)
-            .min_by(|a, b| {
-                let off = |s: &vision::Screw| near.to_whole(s.pixel).distance_px(&center);
-                off(a).total_cmp(&off(b))
-            });
+        let frames = self.keep(&near)?.into_iter().collect();
         self.log(Event::Verified {
-            screws: vec![(target.found, closest.is_some())],
+            screws: vec![(target.found, stands)],
             pictures: vec![picture.clone()],
+            frames,
+            second_look: Some(Box::new(look::second_look_of(target.found, place.as_ref()))),
         })?;
-        let Some(screw) = closest else { return Ok(None) };
-        // the region is too small for the plane of the face: the sheet around the screw has to do
-        let (_, again) = plan::plan(&[screw], &near, None, &self.reaches().await?, &config);
-        Ok(again.first().map(|t| (t.place, picture)))
+        Ok(place.map(|place| (place, picture)))
     }
 
     /// Where a find is in the whole picture, and the half width of a region around it, px.
     fn place_in_picture(&self, found: usize, shot: &Shot) -> Option<(Pixel, f64)> {
         let find = self.record.faces.last()?.found.get(found)?;
-        let depth_mm = find.camera_mm?.z_mm();
-        let pixel_mm = shot.frame.camera?.pixel_mm(depth_mm);
-        let half_px = self.runner.config.inspection.second_look_mm / pixel_mm.max(1e-6);
-        Some((Pixel::new(find.u_px, find.v_px), half_px))
+        look::place_in_picture(find, &shot.frame.camera?, &self.runner.config)
     }
 
     /// Looks again where a screw is said to have come out: in regions, since only these places can have changed, and a whole
@@ -932,27 +888,26 @@ impl Way<'_> {
         let config = self.runner.config.clone();
         let camera = self.runner.devices.color.intrinsics();
         let pixels: Vec<Pixel> = places.iter().map(|p| p.1).collect();
-        let mut seen = Vec::new();
-        let mut pictures = Vec::new();
+        let (mut seen, mut pictures, mut frames) = (Vec::new(), Vec::new(), Vec::new());
         for region in regions_around(&camera, &pixels, half_px) {
             let near = shoot(&self.runner.devices, Some(region), 0).await?;
-            let screws = self.runner.finder.find(&near.frame, self.face_odds())?;
+            seen.extend(self.judge().standing(&near, self.face_odds())?);
             self.budget(&near);
             pictures.push(
                 self.runner
                     .journal
                     .store_picture(&near.frame.color, config.journal.jpeg_quality)?,
             );
-            let standing = screws.iter().filter(|s| s.verdict == Verdict::Screw);
-            seen.extend(standing.map(|s| near.to_whole(s.pixel)));
+            frames.extend(self.keep(&near)?);
         }
-        let same = config.inspection.same_screw_mm / config.inspection.second_look_mm;
-        let screws: Vec<(usize, bool)> = places
-            .iter()
-            .map(|(found, pixel, half_px)| (*found, seen.iter().any(|s| s.distance_px(pixel) <= same * half_px)))
-            .collect();
+        let screws = self.judge().which_stand(&places, &seen);
         let standing = screws.iter().filter(|s| s.1).map(|s| s.0).collect();
-        self.log(Event::Verified { screws, pictures })?;
+        self.log(Event::Verified {
+            screws,
+            pictures,
+            frames,
+            second_look: None,
+        })?;
         Ok(Some(standing))
     }
 
@@ -1085,6 +1040,7 @@ impl Way<'_> {
                 takes_along: takes_along.clone(),
                 time_s: self.now_s() - begin_s,
             },
+            frame: None,
         })?;
         if holding {
             self.lay_aside().await?;

@@ -1,5 +1,6 @@
 //! Rates with their bounds, and times by resource: what a number of units says.
 
+use crate::digest::Digest;
 use crate::record::{Assist, Method, Outcome, Times, UnitRecord};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -48,12 +49,19 @@ pub struct Statistics {
 impl Statistics {
     /// Over finished units; those under way are left out.
     pub fn over(records: &[UnitRecord]) -> Self {
+        Self::of(&records.iter().map(Digest::of).collect::<Vec<_>>())
+    }
+
+    /// The same over units as they are counted.
+    pub fn of(records: &[Digest]) -> Self {
         let mut causes = BTreeMap::new();
         let (mut ok, mut ng, mut excluded, mut after) = (Vec::new(), Vec::new(), 0, 0);
-        let mut attempts = Vec::new();
+        let (mut attempted, mut removed, mut retried) = (0, 0, 0);
         for record in records {
             let Some(outcome) = &record.outcome else { continue };
-            attempts.extend(record.attempts());
+            attempted += record.attempted;
+            removed += record.removed;
+            retried += record.retried;
             let cause = match outcome {
                 Outcome::Ok => {
                     ok.push(record);
@@ -81,7 +89,7 @@ impl Statistics {
             .map(|r| r.assist)
             .collect();
         let with = |most: Assist| whole.iter().filter(|assist| **assist <= most).count();
-        let in_scope: Vec<&UnitRecord> = ok.iter().chain(&ng).copied().collect();
+        let in_scope: Vec<&Digest> = ok.iter().chain(&ng).copied().collect();
         let units = in_scope.len() + excluded;
         let mut times_mean = Times::default();
         for record in &in_scope {
@@ -107,9 +115,9 @@ impl Statistics {
             cycle_ok_mean_s: mean_cycle_s(&ok),
             cycle_ng_mean_s: mean_cycle_s(&ng),
             times_mean,
-            screws_attempted: attempts.len(),
-            screws_removed: Rate::of(attempts.iter().filter(|a| a.removed()).count(), attempts.len()),
-            screws_retried: attempts.iter().filter(|a| a.retries() > 0).count(),
+            screws_attempted: attempted,
+            screws_removed: Rate::of(removed, attempted),
+            screws_retried: retried,
             causes,
         }
     }
@@ -134,14 +142,14 @@ pub struct Shift {
 ///
 /// # Arguments
 /// * `shift_s` – length of a shift, s; more than 0.
-pub fn by_shift(records: &[UnitRecord], shift_s: f64) -> Vec<Shift> {
-    let mut shifts: BTreeMap<u64, Vec<UnitRecord>> = BTreeMap::new();
+pub fn by_shift(records: &[Digest], shift_s: f64) -> Vec<Shift> {
+    let mut shifts: BTreeMap<u64, Vec<Digest>> = BTreeMap::new();
     for record in records.iter().filter(|r| r.outcome.is_some()) {
         let shift = (record.started_s.max(0.0) / shift_s.max(1e-9)) as u64;
         shifts.entry(shift).or_default().push(record.clone());
     }
-    let of = |(shift, records): (u64, Vec<UnitRecord>)| {
-        let s = Statistics::over(&records);
+    let of = |(shift, records): (u64, Vec<Digest>)| {
+        let s = Statistics::of(&records);
         Shift {
             from_s: shift as f64 * shift_s,
             units: s.units,
@@ -153,7 +161,7 @@ pub fn by_shift(records: &[UnitRecord], shift_s: f64) -> Vec<Shift> {
     shifts.into_iter().map(of).collect()
 }
 
-fn mean_cycle_s(records: &[&UnitRecord]) -> Option<f64> {
+fn mean_cycle_s(records: &[&Digest]) -> Option<f64> {
     (!records.is_empty()).then(|| records.iter().map(|r| r.times.cycle_s()).sum::<f64>() / records.len() as f64)
 }
 
@@ -229,7 +237,8 @@ mod tests {
             begun(3, 17.0 * hour, Some(Outcome::Ok)),
             begun(4, 17.5 * hour, None),
         ];
-        let shifts = by_shift(&records, 8.0 * hour);
+        let digests: Vec<Digest> = records.iter().map(Digest::of).collect();
+        let shifts = by_shift(&digests, 8.0 * hour);
         assert_eq!(
             shifts.iter().map(|s| (s.from_s / hour, s.units)).collect::<Vec<_>>(),
             [(0.0, 2), (16.0, 1)]

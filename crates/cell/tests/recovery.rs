@@ -21,7 +21,7 @@ fn block_on<T>(future: impl Future<Output = T>) -> T {
 }
 
 fn runner(fake: &Fake, folder: &Path, change: impl FnOnce(&mut CellConfig)) -> Runner {
-    let mut config = CellConfig::simulated();
+    let mut config = fake::config();
     change(&mut config);
     Runner::new(
         fake.devices(),

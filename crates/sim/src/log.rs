@@ -69,10 +69,16 @@ fn parse(path: &Path, text: &str) -> Result<Vec<Action>, LogError> {
     actions.collect()
 }
 
+/// Room that is held ready beside the log. A real world needs none on the computer's disk to go on: when that is full, this is given back.
+const SPARE_FILE: &str = "world.spare";
+const SPARE_BYTES: usize = 64 * 1024;
+
 /// A log that is open for appending.
 #[derive(Debug)]
 pub(crate) struct ActionLog {
     file: File,
+    bytes: u64,
+    spare: PathBuf,
     /// Why writing stopped, if it did.
     pub(crate) error: Option<String>,
 }
@@ -97,7 +103,16 @@ impl ActionLog {
             .open(path)
             .map_err(file_error)?;
         file.set_len(whole as u64).map_err(file_error)?;
-        Ok((actions, Self { file, error: None }))
+        let spare = path.with_file_name(SPARE_FILE);
+        // a disk that is full already: the log then fails as any other file would
+        let _ = std::fs::write(&spare, vec![b'.'; SPARE_BYTES]);
+        let log = Self {
+            file,
+            bytes: whole as u64,
+            spare,
+            error: None,
+        };
+        Ok((actions, log))
     }
 
     /// Appends an action at once.
@@ -107,7 +122,23 @@ impl ActionLog {
         }
         let written = serde_json::to_string(action)
             .map_err(std::io::Error::other)
-            .and_then(|line| self.file.write_all(format!("{line}\n").as_bytes()));
+            .and_then(|line| self.write(format!("{line}\n").as_bytes()));
         self.error = written.err().map(|e| e.to_string());
+    }
+
+    fn write(&mut self, line: &[u8]) -> Result<(), std::io::Error> {
+        if self.file.write_all(line).is_err() {
+            self.file.set_len(self.bytes)?; // what was written of it
+            std::fs::remove_file(&self.spare)?;
+            self.file.write_all(line)?;
+        }
+        self.bytes += line.len() as u64;
+        Ok(())
+    }
+}
+
+impl Drop for ActionLog {
+    fn drop(&mut self) {
+        let _ = std::fs::remove_file(&self.spare);
     }
 }

@@ -1,13 +1,11 @@
 //! Do the journal and the world agree? Physical actions counted from the simulated world's own log, so that a wrong journal cannot hide.
 
-use anyhow::Result;
 use cell::device::DriveEnd;
-use cell::journal::Journal;
-use cell::program::FaceId;
-use cell::record::{Act, Event};
+use cell::digest::{Claim, Digest};
 use geometry::{Base, Point};
 use serde::Serialize;
 use sim::{Action, ActionKind};
+use std::collections::BTreeMap;
 
 /// Times of journal and world are of the same clock; rounding, s.
 const ROUNDING_S: f64 = 1e-6;
@@ -25,108 +23,84 @@ pub struct Actions {
     pub actions_lost: usize,
 }
 
-/// An intent of the journal with the time until its next event, and what the world did in it.
-struct Slot {
-    pull: bool,
-    /// Face that stood before the camera.
-    face: Option<FaceId>,
-    /// Where the bit was sent; `None` for a pull.
-    aim: Option<Point<Base>>,
-    /// What was pulled at.
-    cover: Option<String>,
-    from_s: f64,
-    until_s: f64,
-    done: bool,
+/// An intent of the journal, and what the world did in it.
+struct Slot<'a> {
+    claim: &'a Claim,
     seen: usize,
     took_effect: bool,
 }
 
 /// Compares a run's journal with its world.
-///
-/// # Errors
-/// If the journal cannot be read.
-pub fn audit(journal: &Journal, world: &[Action]) -> Result<Actions> {
-    let mut total = Actions::default();
-    for unit in journal.units()? {
-        let mut slots = slots(&journal.events(unit)?);
-        // the journal counts units from 1, the world from 0
-        for action in world.iter().filter(|a| a.unit.map(|u| u + 1) == Some(unit)) {
-            let (pull, effect) = match &action.kind {
-                ActionKind::Drive { end, .. } => (false, *end == DriveEnd::Removed),
-                ActionKind::Pull { off, .. } => (true, *off),
-                _ => continue,
-            };
-            total.actions_total += 1;
-            let within = |s: &&mut Slot| {
-                s.pull == pull && s.from_s <= action.t_s + ROUNDING_S && action.t_s <= s.until_s + ROUNDING_S
-            };
-            match slots.iter_mut().rev().find(within) {
-                Some(slot) => {
-                    slot.seen += 1;
-                    slot.took_effect |= effect;
-                }
-                None => total.actions_repeated += 1,
-            }
-        }
-        for (k, slot) in slots.iter().enumerate() {
-            total.actions_repeated += slot.seen.saturating_sub(1);
-            total.actions_lost += usize::from(slot.done && slot.seen == 0);
-            // what a crash left open and the world had done must not be done again
-            let again = |later: &Slot| {
-                let near = |(a, b): (Point<Base>, Point<Base>)| a.distance_mm(b) < SAME_PLACE_MM;
-                let same_place = later.face == slot.face && later.aim.zip(slot.aim).is_some_and(near);
-                let same_cover = slot.pull && later.cover == slot.cover;
-                later.seen > 0 && later.pull == slot.pull && (same_place || same_cover)
-            };
-            let left_open = !slot.done && slot.took_effect;
-            total.actions_repeated += usize::from(left_open && slots[k + 1..].iter().any(again));
+pub fn audit(units: &[Digest], world: &[Action]) -> Actions {
+    let mut of_unit = BTreeMap::<u64, Vec<&Action>>::new();
+    for action in world {
+        if let Some(unit) = action.unit {
+            // the journal counts units from 1, the world from 0
+            of_unit.entry(unit + 1).or_default().push(action);
         }
     }
-    Ok(total)
+    let mut total = Actions::default();
+    for unit in units {
+        let actions = of_unit.remove(&unit.unit).unwrap_or_default();
+        compare(&unit.claims, &actions, &mut total);
+    }
+    // what was done to units that the journal does not know
+    for actions in of_unit.values() {
+        compare(&[], actions, &mut total);
+    }
+    total
 }
 
-fn slots(events: &[(f64, Event)]) -> Vec<Slot> {
-    let (mut slots, mut face, mut open) = (Vec::<Slot>::new(), None, false);
-    for (t_s, event) in events {
-        if let (true, Some(slot)) = (open, slots.last_mut()) {
-            slot.until_s = *t_s;
-            slot.done = match event {
-                Event::Driven { burst, .. } => burst.end.is_some(),
-                Event::Pulled { .. } => true,
-                _ => false,
-            };
-        }
-        open = false;
-        match event {
-            Event::Presented { face: now } => face = Some(now.clone()),
-            Event::Intent { act } => {
-                let (aim, cover) = match act {
-                    Act::Drive { aim, .. } => (Some(*aim), None),
-                    Act::Pull { cover } => (None, Some(cover.clone())),
-                    _ => continue,
-                };
-                open = true;
-                slots.push(Slot {
-                    pull: cover.is_some(),
-                    face: face.clone(),
-                    aim,
-                    cover,
-                    from_s: *t_s,
-                    until_s: f64::INFINITY,
-                    done: false,
-                    seen: 0,
-                    took_effect: false,
-                });
+fn compare(claims: &[Claim], world: &[&Action], total: &mut Actions) {
+    let mut slots: Vec<Slot<'_>> = claims
+        .iter()
+        .map(|claim| Slot {
+            claim,
+            seen: 0,
+            took_effect: false,
+        })
+        .collect();
+    for action in world {
+        let (pull, effect) = match &action.kind {
+            ActionKind::Drive { end, .. } => (false, *end == DriveEnd::Removed),
+            ActionKind::Pull { off, .. } => (true, *off),
+            _ => continue,
+        };
+        total.actions_total += 1;
+        let within = |s: &&mut Slot<'_>| {
+            s.claim.cover.is_some() == pull
+                && s.claim.from_s <= action.t_s + ROUNDING_S
+                && s.claim.until_s.is_none_or(|until_s| action.t_s <= until_s + ROUNDING_S)
+        };
+        match slots.iter_mut().rev().find(within) {
+            Some(slot) => {
+                slot.seen += 1;
+                slot.took_effect |= effect;
             }
-            _ => {}
+            None => total.actions_repeated += 1,
         }
     }
-    slots
+    for (k, slot) in slots.iter().enumerate() {
+        let claim = slot.claim;
+        total.actions_repeated += slot.seen.saturating_sub(1);
+        total.actions_lost += usize::from(claim.done && slot.seen == 0);
+        // what a crash left open and the world had done must not be done again
+        let again = |later: &Slot<'_>| {
+            let near = |(a, b): (Point<Base>, Point<Base>)| a.distance_mm(b) < SAME_PLACE_MM;
+            let same_place = later.claim.face == claim.face && later.claim.aim.zip(claim.aim).is_some_and(near);
+            let same_cover = claim.cover.is_some() && later.claim.cover == claim.cover;
+            later.seen > 0 && (same_place || same_cover)
+        };
+        let left_open = !claim.done && slot.took_effect;
+        total.actions_repeated += usize::from(left_open && slots[k + 1..].iter().any(again));
+    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use cell::Journal;
+    use cell::record::{Act, Event};
 
     fn drive(x: f64) -> Event {
         Event::Intent {
@@ -175,7 +149,7 @@ mod tests {
         for (t_s, event) in events {
             journal.append(unit, *t_s, event).expect("event");
         }
-        let a = audit(&journal, world).expect("audit");
+        let a = audit(&journal.digests(false).expect("units"), world);
         (a.actions_total, a.actions_repeated, a.actions_lost)
     }
 

@@ -15,6 +15,7 @@ mod gantt;
 mod model;
 mod output;
 mod plan;
+mod replay;
 mod report;
 mod run;
 mod simulate;
@@ -60,6 +61,8 @@ enum Command {
     Simulate(simulate::Args),
     /// Schedule for a product description over arms and tables, with a lower bound and a chart.
     Plan(plan::Args),
+    /// Decide a recorded shift again, with the same or another model, map or cell file, and say what would have changed.
+    Replay(replay::Args),
     /// Rates with bounds and times by resource, from a run's journal.
     Stats(stats::Args),
 }
@@ -89,6 +92,7 @@ fn main() -> ExitCode {
         Command::Synth(args) => synth::run(&args),
         Command::Simulate(args) => simulate::run(&args),
         Command::Plan(args) => plan::run(&args),
+        Command::Replay(args) => replay::run(&args),
         Command::Stats(args) => stats::run(&args),
     };
     match result {

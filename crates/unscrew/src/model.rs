@@ -29,6 +29,14 @@ enum Provider {
 }
 
 impl ModelArgs {
+    /// The bytes of the model file that they name.
+    pub(crate) fn bytes(&self) -> Result<Vec<u8>> {
+        match &self.model {
+            Some(path) => std::fs::read(path).with_context(|| format!("reading {}", path.display())),
+            None => Ok(vision::EMBEDDED_MODEL.to_vec()),
+        }
+    }
+
     /// The detector that they ask for.
     pub(crate) fn detector(&self) -> Result<Detector> {
         let detector = match &self.model {

@@ -13,6 +13,7 @@ use anyhow::{Context, Result, bail};
 use calibration::{Identity, Map, Settings, Volume, camera_identity, read_pairs};
 use cell::{
     CaptureSettings, CellConfig, Journal, Observer, Outcome, Program, Runner, Statistics, UnitRecord,
+    basis::{ArmParts, Basis},
     capture_pairs as capture,
     config::Backend,
     device::Devices,
@@ -32,6 +33,7 @@ use std::{
     },
     time::Instant,
 };
+use vision::Detector;
 
 /// Takes units apart: finds their screws, maps them into the robot's base, takes them out, pulls the covers.
 #[derive(clap::Args)]
@@ -65,6 +67,9 @@ pub struct Args {
     visits: Visits,
     #[command(flatten)]
     model: ModelArgs,
+    /// Keep every frame that is decided on without loss, for `unscrew replay`: about 140 MB a unit, where its pictures are 10
+    #[arg(long)]
+    record: bool,
     /// Print the summary as JSON
     #[arg(long)]
     json: bool,
@@ -116,26 +121,28 @@ pub fn run(args: &Args) -> Result<Ended> {
         },
         assumptions(&settings),
     );
-    let journal = Journal::open(&args.out)?;
+    let mut journal = Journal::open(&args.out)?;
+    config.journal.keep_frames |= args.record || recorded_so_far(&journal, &args.out)?;
+    let program = Program::paper()?;
+    let basis = basis(args, &simulated.devices, &detector, &config, &program)?;
+    journal.begin_start(&basis)?;
     let mut runner = Runner::new(
         simulated.devices.clone(),
         Arc::new(detector),
         maps,
-        Program::paper()?,
+        program,
         config,
         journal,
     )?;
     // whoever runs this command asks for the start; with --resume too, and again after every stop
     runner.start()?;
     let live = Live::new(&simulated, args.units, args.json);
-    let mut records = runner.journal().records()?;
     let finish = |records: &[UnitRecord]| write_results(args, records, &live, &calibration, &provenance);
-    if args.resume
-        && let Some(record) = runtime.block_on(runner.resume_unit(&live))?
-    {
-        records.retain(|r| r.unit != record.unit);
-        records.push(record);
+    // the unit that stands on the table first: counting those before it can wait
+    if args.resume {
+        runtime.block_on(runner.resume_unit(&live))?;
     }
+    let mut records = runner.journal().records()?;
     while (records.len() as u64) < args.units && !stop.load(Ordering::SeqCst) {
         let first = records.is_empty();
         records.push(runtime.block_on(runner.run_unit(&live))?);
@@ -192,6 +199,40 @@ fn assumptions(settings: &SimSettings) -> String {
     }
 }
 
+/// Whether the run that is gone on with keeps its frames.
+fn recorded_so_far(journal: &Journal, run: &Path) -> Result<bool> {
+    Ok(match journal.starts()?.last() {
+        Some((_, basis)) => basis.config(run)?.journal.keep_frames,
+        None => false,
+    })
+}
+
+/// Copies of what the run decides with, beside its journal.
+fn basis(args: &Args, devices: &Devices, detector: &Detector, config: &CellConfig, program: &Program) -> Result<Basis> {
+    let arms: Vec<(&str, PathBuf, bool)> = devices
+        .arms
+        .iter()
+        .map(|arm| {
+            let name = arm.robot.name();
+            (name, map_path(&args.maps, name), arm.driver.is_some())
+        })
+        .collect();
+    let parts: Vec<ArmParts<'_>> = arms
+        .iter()
+        .map(|(name, map, drives)| ArmParts {
+            name,
+            map: Some(map),
+            drives: *drives,
+        })
+        .collect();
+    let model = (detector.model().id(), Some(&args.model.bytes()?[..]));
+    Ok(Basis::keep(&args.out, model, &parts, config, program)?)
+}
+
+fn map_path(folder: &Path, arm: &str) -> PathBuf {
+    folder.join(format!("map_{arm}.json"))
+}
+
 /// A map for every arm: those in the folder if they are this cell's, else captured and fitted now.
 async fn calibrated(
     settings: &SimSettings,
@@ -209,7 +250,7 @@ async fn calibrated(
             arm: format!("{name} of simulated cell {}", settings.seed),
             camera: camera.clone(),
         };
-        let path = folder.join(format!("map_{name}.json"));
+        let path = map_path(folder, &name);
         if path.exists() {
             let map = Map::load_for(&path, &identity)?;
             let (age_days, most) = (output::age_days(map.known_good_on()), config.approach.map_age_max_days);

@@ -2,7 +2,7 @@
 
 use crate::Ended;
 use crate::audit::{Actions, audit};
-use anyhow::Result;
+use anyhow::{Result, bail};
 use cell::{
     forecast::{Assumptions, Prediction, predictions},
     journal::Journal,
@@ -21,6 +21,9 @@ pub struct Args {
     /// Length of a shift, hours: with more than one, rates by shift are told too
     #[arg(long, value_name = "HOURS", default_value_t = 8.0, value_parser = shift_length)]
     shift_h: f64,
+    /// Count every unit anew from its events, instead of from what was written down when it was closed
+    #[arg(long)]
+    recount: bool,
     /// As JSON
     #[arg(long)]
     json: bool,
@@ -50,15 +53,21 @@ struct Printed {
 
 pub fn run(args: &Args) -> Result<Ended> {
     let journal = Journal::open_read_only(&args.run)?;
-    let records = journal.records()?;
-    let statistics = Statistics::over(&records);
     let world = args.run.join("world.jsonl");
-    let actions = world
-        .exists()
-        .then(|| audit(&journal, &sim::read_actions(&world)?))
-        .transpose()?;
-    let predictions = predictions(&Assumptions::default(), &records);
-    let shifts = by_shift(&records, 3600.0 * args.shift_h);
+    // the two logs are read side by side: each is long after a shift
+    let (units, actions) = std::thread::scope(|scope| {
+        let world = scope.spawn(|| world.exists().then(|| sim::read_actions(&world)).transpose());
+        (journal.digests(args.recount), world.join())
+    });
+    let units = units?;
+    let actions = match actions {
+        Ok(actions) => actions?,
+        Err(_) => bail!("the simulated world's log could not be read to its end; report it"),
+    };
+    let statistics = Statistics::of(&units);
+    let actions = actions.map(|actions| audit(&units, &actions));
+    let predictions = predictions(&Assumptions::default(), &units);
+    let shifts = by_shift(&units, 3600.0 * args.shift_h);
     if args.json {
         let printed = Printed {
             statistics,

@@ -1,22 +1,12 @@
-//! Up the ladder with one screw that did not come out at once, and what a person says of a picture.
+//! Up the ladder with one screw that did not come out at once, and questions to a person.
 
 use super::{Stop, Way};
-use crate::capture::{Shot, sheet_depth_mm};
+use crate::capture::Shot;
 use crate::device::{DeviceError, DriveEnd, DriveProgram, Question, TagValue, tags};
 use crate::ladder::{Cause, Climb, Rung};
 use crate::plan::{SafeTarget, Target};
 use crate::policy::{Case, Choice};
 use crate::record::{Event, Verdict};
-use geometry::Pixel;
-
-/// A click means the candidate whose middle lies within this share of its head's diameter.
-const SAME_HEAD: f64 = 0.6;
-/// Width that is taken for a head that only a person has seen, mm.
-const USUAL_HEAD_MM: f64 = 9.5;
-/// The same in a picture, px.
-const USUAL_HEAD_PX: f64 = 30.0;
-/// Standard error of a click, px.
-const CLICK_PX: f64 = 1.5;
 
 impl Way<'_> {
     /// One screw: a burst, and the ladder of its cause if it does not come out.
@@ -137,28 +127,25 @@ impl Way<'_> {
         self.runner.config.help.click && self.runner.devices.operator.is_some()
     }
 
-    /// Asks a person to click on the screws in a picture. Every candidate that is clicked on becomes one; a click beside all of them a new
-    /// one. `screws` stay as they are if nobody may be asked or answers.
-    pub(super) async fn ask(
-        &mut self,
-        shot: &Shot,
-        screws: Vec<vision::Screw>,
-        text: &str,
-    ) -> Result<Vec<vision::Screw>, Stop> {
+    /// Asks a person to click on the screws in a picture.
+    ///
+    /// # Returns
+    /// The clicks, px of the whole picture; `None` if nobody may be asked or answers.
+    pub(super) async fn ask(&mut self, shot: &Shot, text: &str) -> Result<Option<Vec<[f64; 2]>>, Stop> {
         let Some(operator) = self.runner.devices.operator.clone().filter(|_| self.may_ask()) else {
-            return Ok(screws);
+            return Ok(None);
         };
         let config = self.runner.config.clone();
         let color = &shot.frame.color;
         let picture = self.runner.journal.store_picture(color, config.journal.jpeg_quality)?;
-        let in_doubt = screws.iter().filter(|s| s.verdict == Verdict::Review);
+        let in_doubt = self.record.faces.last().into_iter().flat_map(|face| &face.found);
         let question = Question {
             text: text.to_owned(),
             image: color.clone(),
             region: shot.region,
             doubtful: in_doubt
-                .map(|s| shot.to_whole(s.pixel))
-                .map(|p| [p.u_px, p.v_px])
+                .filter(|f| f.verdict == Verdict::Review)
+                .map(|f| [f.u_px, f.v_px])
                 .collect(),
         };
         let clicks = match operator.point_at_screws(&question, config.help.timeout_s).await {
@@ -171,48 +158,6 @@ impl Way<'_> {
             picture,
             clicks: clicks.clone(),
         })?;
-        Ok(clicked_on(shot, screws, &clicks.unwrap_or_default()))
+        Ok(clicks)
     }
-}
-
-/// What is a screw once a person has clicked.
-fn clicked_on(shot: &Shot, mut screws: Vec<vision::Screw>, clicks: &[[f64; 2]]) -> Vec<vision::Screw> {
-    for click in clicks {
-        let corner = [f64::from(shot.region.x_px), f64::from(shot.region.y_px)];
-        let pixel = Pixel::new(click[0] - corner[0], click[1] - corner[1]);
-        let near = screws
-            .iter_mut()
-            .filter(|s| s.pixel.distance_px(&pixel) < SAME_HEAD * s.diameter_px)
-            .min_by(|a, b| a.pixel.distance_px(&pixel).total_cmp(&b.pixel.distance_px(&pixel)));
-        match near {
-            Some(screw) => screw.verdict = Verdict::Screw,
-            None => screws.extend(seen_by_a_person(shot, pixel)),
-        }
-    }
-    screws
-}
-
-/// A screw that only a person has seen; `None` without depth there.
-fn seen_by_a_person(shot: &Shot, pixel: Pixel) -> Option<vision::Screw> {
-    let camera = shot.frame.camera?;
-    // how wide it is in the picture depends on how far away it is, which is measured around it
-    let roughly_mm = sheet_depth_mm(&shot.frame, pixel, USUAL_HEAD_PX)?;
-    let around_px = USUAL_HEAD_MM / camera.pixel_mm(roughly_mm).max(1e-6);
-    let depth_mm = sheet_depth_mm(&shot.frame, pixel, around_px)?;
-    Some(vision::Screw {
-        pixel,
-        sigma_px: CLICK_PX,
-        diameter_px: around_px,
-        score: 1.0,
-        fits: 1.0,
-        drive: vision::Drive::Cross,
-        verdict: Verdict::Screw,
-        cues: Vec::new(),
-        angle_rad: None,
-        camera: Some(camera.unproject(pixel, depth_mm)),
-        normal: crate::capture::sheet_normal(&shot.frame, pixel, around_px),
-        top_normal: None,
-        sigma_lateral_mm: Some(CLICK_PX * camera.pixel_mm(depth_mm)),
-        sigma_depth_mm: None,
-    })
 }

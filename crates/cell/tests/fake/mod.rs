@@ -1,5 +1,7 @@
 //! A cell of a few lines, every device in one mutex: what the tests need to see what was asked of the devices, and in which order.
 
+#![allow(dead_code)] // each test file uses its own part
+
 use async_trait::async_trait;
 use calibration::{Map, Pair, Settings, Volume, lattice};
 use cell::device::*;
@@ -218,6 +220,11 @@ pub fn volume() -> Volume {
 
 /// A map fitted to pairs that are right to the last digit.
 pub fn map() -> Map {
+    map_that_is_off(0.0)
+}
+
+/// A map that sends the arm so far too high.
+pub fn map_that_is_off(by_mm: f64) -> Map {
     let pairs: Vec<Pair> = lattice(&volume(), 100.0)
         .expect("a lattice")
         .into_iter()
@@ -227,7 +234,7 @@ pub fn map() -> Map {
                 id: t.id,
                 node: t.node,
                 t_s: 0.0,
-                command: t.command,
+                command: t.command.moved(Direction::new(0.0, 0.0, 1.0).expect("up"), by_mm),
                 pixel: self::camera().project(camera),
                 depth_mm: Some(camera.z_mm()),
                 camera: Some(camera),
@@ -287,11 +294,77 @@ impl ColorCamera for Fake {
         let entry = format!("{what} {}", world.presented);
         world.log.push(entry);
         let region = whole(region);
+        let mut image = RgbImage::from_pixel(region.width_px, region.height_px, image::Rgb([120, 120, 118]));
+        let tilt = world.tilt_rad.get(&world.presented).copied().unwrap_or(0.0);
+        for head in world
+            .faces
+            .get(&world.presented)
+            .into_iter()
+            .flatten()
+            .filter(|h| h.stands)
+        {
+            if let Some(pixel) = camera().project(on_face(head.at_mm, tilt)) {
+                paint(&mut image, region, pixel);
+            }
+        }
         Ok(ColorFrame {
-            image: RgbImage::from_pixel(region.width_px, region.height_px, image::Rgb([120, 120, 118])),
+            image,
             region,
             t_s: world.t_s,
         })
+    }
+}
+
+/// A head is a bright pixel; green and blue say where in it the centre is, in hundredths.
+fn paint(image: &mut RgbImage, region: Region, at: Pixel) {
+    let (u, v) = (at.u_px.floor(), at.v_px.floor());
+    let (x, y) = (u - f64::from(region.x_px), v - f64::from(region.y_px));
+    if x >= 0.0 && y >= 0.0 && x < f64::from(region.width_px) && y < f64::from(region.height_px) {
+        let part = |c: f64| (100.0 * (c - c.floor())).round() as u8;
+        image.put_pixel(x as u32, y as u32, image::Rgb([255, part(at.u_px), part(at.v_px)]));
+    }
+}
+
+/// Finds what is painted: the picture alone decides, as with a real detector.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct PixelFinder {
+    /// Heads that it overlooks, from the top left.
+    pub overlooks: usize,
+}
+
+impl Finder for PixelFinder {
+    fn find(&self, frame: &RgbdFrame, _: f64) -> Result<Vec<vision::Screw>, DeviceError> {
+        let Some(camera) = frame.camera else {
+            return Ok(Vec::new());
+        };
+        let heads = frame.color.enumerate_pixels().filter(|(_, _, p)| p.0[0] == 255);
+        let screws = heads.skip(self.overlooks).map(|(x, y, p)| {
+            let pixel = Pixel::new(
+                f64::from(x) + f64::from(p.0[1]) / 100.0,
+                f64::from(y) + f64::from(p.0[2]) / 100.0,
+            );
+            let plane = frame.depth.as_ref().and_then(|d| d.plane_at(pixel, 0.0, 20.0));
+            vision::Screw {
+                pixel,
+                sigma_px: 0.2,
+                diameter_px: 9.0 / camera.pixel_mm(1500.0),
+                score: 0.95,
+                fits: 0.95,
+                drive: vision::Drive::Cross,
+                verdict: vision::Verdict::Screw,
+                cues: Vec::new(),
+                angle_rad: None,
+                camera: plane.map(|plane| camera.unproject(pixel, plane.depth_mm)),
+                normal: None,
+                top_normal: None,
+                sigma_lateral_mm: Some(0.1),
+                sigma_depth_mm: Some(0.1),
+            }
+        });
+        Ok(screws.collect())
+    }
+    fn model(&self) -> String {
+        "pixels".into()
     }
 }
 

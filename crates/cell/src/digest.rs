@@ -1,0 +1,131 @@
+//! What counting needs of a finished unit, so that a shift of thousands of units is counted in seconds: written down in the transaction
+//! that closes the unit, from its events and nothing else, and sealed as they are.
+
+use crate::program::FaceId;
+use crate::record::{Act, Assist, Event, LeftAlone, Method, Outcome, Purpose, ScrewAttempt, Times, UnitRecord};
+use geometry::{Base, Point};
+use serde::{Deserialize, Serialize};
+
+/// A unit as it is counted.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Digest {
+    /// Number of the unit.
+    pub unit: u64,
+    /// What became of it; `None` while it is under way.
+    pub outcome: Option<Outcome>,
+    /// When it was begun, cell clock, s.
+    #[serde(default)]
+    pub started_s: f64,
+    /// What a person did for it.
+    #[serde(default)]
+    pub assist: Assist,
+    /// What it cost.
+    #[serde(default)]
+    pub method: Method,
+    /// Seconds by resource.
+    pub times: Times,
+    /// Screws that were acted on.
+    pub attempted: usize,
+    /// Of these out, as far as driver and camera say.
+    pub removed: usize,
+    /// Of these, with more than one burst.
+    pub retried: usize,
+    /// Scores of the finds that were acted on.
+    pub scores_acted_on: Vec<f64>,
+    /// Scores of the finds that were left alone in doubt.
+    pub scores_in_doubt: Vec<f64>,
+    /// What the journal says was done to it, in order.
+    pub claims: Vec<Claim>,
+}
+
+/// An intent of the journal, with the time until its next event: when a physical action may have happened, and whether the journal says
+/// that one did.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Claim {
+    /// Face that stood before the camera.
+    pub face: Option<FaceId>,
+    /// Where the bit was sent; `None` for a pull.
+    pub aim: Option<Point<Base>>,
+    /// What was pulled at; `None` for a burst.
+    pub cover: Option<String>,
+    /// Time of the intent, cell clock, s.
+    pub from_s: f64,
+    /// Time of the event after it; `None`: it is the last one.
+    pub until_s: Option<f64>,
+    /// True if the journal says how it ended.
+    pub done: bool,
+}
+
+impl Digest {
+    /// Of a record without what was done: enough for rates and times.
+    pub fn of(record: &UnitRecord) -> Self {
+        let attempts: Vec<&ScrewAttempt> = record.attempts().collect();
+        let found = || {
+            let looks = record.faces.iter().filter(|f| f.purpose == Purpose::Work);
+            looks.flat_map(|f| &f.found)
+        };
+        let scores = |left: Option<LeftAlone>| {
+            let of = found().filter(|f| f.left_alone == left);
+            of.map(|f| f.score).collect()
+        };
+        Self {
+            unit: record.unit,
+            outcome: record.outcome.clone(),
+            started_s: record.started_s,
+            assist: record.assist,
+            method: record.method,
+            times: record.times,
+            attempted: attempts.len(),
+            removed: attempts.iter().filter(|a| a.removed()).count(),
+            retried: attempts.iter().filter(|a| a.retries() > 0).count(),
+            scores_acted_on: scores(None),
+            scores_in_doubt: scores(Some(LeftAlone::Review)),
+            claims: Vec::new(),
+        }
+    }
+
+    /// Of a unit's events.
+    pub fn from_events(unit: u64, started_s: f64, events: &[(f64, Event)]) -> Self {
+        Self {
+            claims: claims(events),
+            ..Self::of(&UnitRecord::from_events(unit, started_s, events))
+        }
+    }
+}
+
+/// The intents to act on a unit, with their ends.
+fn claims(events: &[(f64, Event)]) -> Vec<Claim> {
+    let (mut claims, mut face, mut open) = (Vec::<Claim>::new(), None, false);
+    for (t_s, event) in events {
+        if let (true, Some(claim)) = (open, claims.last_mut()) {
+            claim.until_s = Some(*t_s);
+            claim.done = match event {
+                Event::Driven { burst, .. } => burst.end.is_some(),
+                Event::Pulled { .. } => true,
+                _ => false,
+            };
+        }
+        open = false;
+        match event {
+            Event::Presented { face: now } => face = Some(now.clone()),
+            Event::Intent { act } => {
+                let (aim, cover) = match act {
+                    Act::Drive { aim, .. } => (Some(*aim), None),
+                    Act::Pull { cover } => (None, Some(cover.clone())),
+                    _ => continue,
+                };
+                open = true;
+                claims.push(Claim {
+                    face: face.clone(),
+                    aim,
+                    cover,
+                    from_s: *t_s,
+                    until_s: None,
+                    done: false,
+                });
+            }
+            _ => {}
+        }
+    }
+    claims
+}

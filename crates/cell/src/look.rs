@@ -1,0 +1,342 @@
+//! From a shot to a decision: what the program makes of a picture, and nothing else. The [`Runner`](crate::run::Runner) and a replay
+//! both decide here, so that the same frame, model, maps and cell file give the same decision, byte by byte.
+
+use crate::capture::{FaceFit, Shot, sheet_depth_mm, sheet_normal};
+use crate::config::CellConfig;
+use crate::device::DeviceError;
+use crate::plan::{self, Reach, SafeTarget, Target};
+use crate::program::{FaceId, Step};
+use crate::record::{ExclusionReason, FacePlane, FaceRecord, Found, PullEnd, Purpose, UnitRecord, Verdict};
+use crate::run::Finder;
+use geometry::{Base, CameraModel, Direction, Pixel, Point, RgbdFrame};
+use serde::{Deserialize, Serialize};
+
+/// A cover is off if the sheet around its screws lies this much deeper than before, mm.
+const COVER_OFF_MM: f64 = 15.0;
+
+/// A click means the candidate whose middle lies within this share of its head's diameter.
+const SAME_HEAD: f64 = 0.6;
+/// Width that is taken for a head that only a person has seen, mm.
+const USUAL_HEAD_MM: f64 = 9.5;
+/// The same in a picture, px.
+const USUAL_HEAD_PX: f64 = 30.0;
+/// Standard error of a click, px.
+const CLICK_PX: f64 = 1.5;
+
+/// What decides beside the picture: model, maps, cell file.
+#[derive(Clone)]
+pub struct Judge<'a> {
+    /// Finds screws.
+    pub finder: &'a dyn Finder,
+    /// Arms that can take screws out, with their maps.
+    pub reaches: Vec<Reach<'a>>,
+    /// Rules and limits.
+    pub config: &'a CellConfig,
+}
+
+impl std::fmt::Debug for Judge<'_> {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Judge")
+            .field("reaches", &self.reaches)
+            .finish_non_exhaustive()
+    }
+}
+
+/// Why a face is looked at.
+#[derive(Clone, Copy, Debug)]
+pub struct Question<'a> {
+    /// Number of the step in the program.
+    pub index: usize,
+    /// The step.
+    pub step: &'a Step,
+    /// The face.
+    pub face: &'a FaceId,
+    /// To what end.
+    pub purpose: Purpose,
+    /// What is known of the unit so far.
+    pub so_far: &'a UnitRecord,
+    /// Where a person has clicked on screws, px of the whole picture, if one was asked.
+    pub clicks: Option<&'a [[f64; 2]]>,
+}
+
+/// Where an arm is sent: a [`SafeTarget`] for the record, which cannot be made into one again.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Aim {
+    /// Number in [`FaceRecord::found`].
+    pub found: usize,
+    /// Number of the arm.
+    pub arm: usize,
+    /// Where the bit meets the screw.
+    pub tip: Point<Base>,
+    /// Direction in which it comes.
+    pub approach: Direction<Base>,
+    /// Where the straight way begins, mm before the screw.
+    pub standoff_mm: f64,
+}
+
+impl Aim {
+    fn at(found: usize, place: &SafeTarget) -> Self {
+        Self {
+            found,
+            arm: place.arm(),
+            tip: place.tip(),
+            approach: place.approach(),
+            standoff_mm: place.standoff_mm(),
+        }
+    }
+}
+
+/// What follows from a look at a face.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Decision {
+    /// The screws to take out, in this order.
+    pub targets: Vec<Aim>,
+    /// Why the unit is out of scope, if it is: for counting, and in words.
+    pub excluded: Option<(ExclusionReason, String)>,
+}
+
+/// What follows from a second look at a screw.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct SecondLook {
+    /// Where it is driven at; `None` if no screw stands there any more or no arm may go there.
+    pub aim: Option<Aim>,
+}
+
+/// A face as judged.
+#[derive(Clone, Debug)]
+pub struct Judged {
+    /// What was found; its `picture` is for the caller to name.
+    pub face: FaceRecord,
+    /// What to do.
+    pub targets: Vec<Target>,
+    /// Why not to do it.
+    pub excluded: Option<(ExclusionReason, String)>,
+}
+
+impl Judged {
+    /// The decision for the record.
+    pub fn decision(&self) -> Decision {
+        Decision {
+            targets: self.targets.iter().map(|t| Aim::at(t.found, &t.place)).collect(),
+            excluded: self.excluded.clone(),
+        }
+    }
+}
+
+impl Judge<'_> {
+    /// How much likelier than pictures say a doubtful head is a screw: a cover that does not come off is evidence.
+    pub fn odds(&self, purpose: Purpose) -> f64 {
+        odds(self.config, purpose)
+    }
+
+    /// What is on a face, what to do with it, and whether the unit is out of scope.
+    ///
+    /// # Errors
+    /// The finder's.
+    pub fn face(&self, shot: &Shot, question: &Question<'_>) -> Result<Judged, DeviceError> {
+        let config = self.config;
+        let Question {
+            index,
+            step,
+            face,
+            purpose,
+            so_far,
+            clicks,
+        } = *question;
+        let odds = self.odds(purpose);
+        let screws = self.finder.find(&shot.frame, odds)?;
+        let mut screws = clicked_on(shot, screws, clicks.unwrap_or_default());
+        let certain = screws
+            .iter()
+            .filter(|s| !plan::is_doubtful(s.fits, odds) || s.verdict == Verdict::Other);
+        let heads: Vec<(Pixel, f64)> = certain.map(|s| (s.pixel, s.diameter_px)).collect();
+        let fit = FaceFit::around(&shot.frame, &heads, config.inspection.working_depth_mm);
+        let before = so_far.faces.iter().rev().find(|f| f.face == *face);
+        let before = before.map_or(&[][..], |f| &f.found);
+        plan::bound_doubtful(&mut screws, odds, config.inspection.doubtful_max, before, fit.as_ref());
+        let (found, targets) = plan::plan(&screws, shot, fit.as_ref(), &self.reaches, config);
+        let heads = screws
+            .iter()
+            .filter(|s| s.verdict == Verdict::Screw)
+            .filter_map(|s| s.top_normal);
+        let plane = fit.as_ref().and_then(|fit| {
+            let heads_lean_rad = fit.lean_rad(heads);
+            fit.plane().map(|plane| FacePlane {
+                heads_lean_rad,
+                ..plane
+            })
+        });
+        let seen = FaceRecord {
+            step: index,
+            step_name: step.name.clone(),
+            face: face.clone(),
+            purpose,
+            t_s: shot.frame.t_s,
+            picture: None,
+            width_px: shot.frame.color.width(),
+            height_px: shot.frame.color.height(),
+            plane,
+            found,
+            attempts: Vec::new(),
+        };
+        // Excluded is what was out of scope before this face was touched. Once it has been, a failure is a failure.
+        let touched = so_far.faces.iter().any(|f| f.face == *face && !f.attempts.is_empty());
+        let least = if purpose == Purpose::Work {
+            step.least_screws()
+        } else {
+            0
+        };
+        let excluded = if touched || matches!(purpose, Purpose::Missed | Purpose::Clicked) {
+            None
+        } else {
+            plan::exclusion(&seen, least, config)
+        };
+        Ok(Judged {
+            face: seen,
+            targets,
+            excluded,
+        })
+    }
+
+    /// The screw that still stands at a place of the whole picture, mapped anew.
+    ///
+    /// # Arguments
+    /// * `clicks` – where a person has clicked, if one was asked.
+    ///
+    /// # Returns
+    /// Whether one does, and where an arm may go for it.
+    ///
+    /// # Errors
+    /// The finder's.
+    pub fn second_look(
+        &self,
+        near: &Shot,
+        (center, half_px): (Pixel, f64),
+        odds: f64,
+        clicks: Option<&[[f64; 2]]>,
+    ) -> Result<(bool, Option<SafeTarget>), DeviceError> {
+        let screws = self.finder.find(&near.frame, odds)?;
+        let screws = clicked_on(near, screws, clicks.unwrap_or_default());
+        let same_px = self.same_px(half_px);
+        let off = |s: &vision::Screw| near.to_whole(s.pixel).distance_px(&center);
+        let closest = screws
+            .into_iter()
+            .filter(|s| s.verdict == Verdict::Screw && off(s) <= same_px)
+            .min_by(|a, b| off(a).total_cmp(&off(b)));
+        let Some(screw) = closest else { return Ok((false, None)) };
+        // the region is too small for the plane of the face: the sheet around the screw has to do
+        let (_, again) = plan::plan(&[screw], near, None, &self.reaches, self.config);
+        Ok((true, again.first().map(|t| t.place)))
+    }
+
+    /// Where screws stand in a shot, in pixels of the whole picture.
+    ///
+    /// # Errors
+    /// The finder's.
+    pub fn standing(&self, near: &Shot, odds: f64) -> Result<Vec<Pixel>, DeviceError> {
+        let screws = self.finder.find(&near.frame, odds)?;
+        let standing = screws.iter().filter(|s| s.verdict == Verdict::Screw);
+        Ok(standing.map(|s| near.to_whole(s.pixel)).collect())
+    }
+
+    /// Of places (number, pixel, half width of the region around it), which of them have a screw.
+    pub fn which_stand(&self, places: &[(usize, Pixel, f64)], standing: &[Pixel]) -> Vec<(usize, bool)> {
+        let stands = |pixel: &Pixel, half_px: f64| {
+            let same_px = self.same_px(half_px);
+            standing.iter().any(|s| s.distance_px(pixel) <= same_px)
+        };
+        places
+            .iter()
+            .map(|(found, p, half)| (*found, stands(p, *half)))
+            .collect()
+    }
+
+    fn same_px(&self, half_px: f64) -> f64 {
+        self.config.inspection.same_screw_mm * half_px / self.config.inspection.second_look_mm
+    }
+}
+
+/// How much likelier than pictures say a doubtful head is a screw.
+pub fn odds(config: &CellConfig, purpose: Purpose) -> f64 {
+    match purpose {
+        Purpose::Missed => config.inspection.stuck_cover_odds,
+        Purpose::Survey | Purpose::Work | Purpose::Clicked => 1.0,
+    }
+}
+
+/// What a second look needs for the record.
+pub fn second_look_of(found: usize, place: Option<&SafeTarget>) -> SecondLook {
+    SecondLook {
+        aim: place.map(|place| Aim::at(found, place)),
+    }
+}
+
+/// Where a find is in the whole picture, and the half width of a region around it, px.
+///
+/// # Arguments
+/// * `camera` – that of the shot of the whole face.
+pub fn place_in_picture(find: &Found, camera: &CameraModel, config: &CellConfig) -> Option<(Pixel, f64)> {
+    let pixel_mm = camera.pixel_mm(find.camera_mm?.z_mm());
+    let half_px = config.inspection.second_look_mm / pixel_mm.max(1e-6);
+    Some((Pixel::new(find.u_px, find.v_px), half_px))
+}
+
+/// Whether a cover is still there: the sheet around the places where the screws of its face were.
+pub fn cover_off(now: &RgbdFrame, before: Option<&FaceRecord>) -> PullEnd {
+    let places = before
+        .into_iter()
+        .flat_map(|f| &f.found)
+        .filter_map(|f| Some((f, f.camera_mm?.z_mm())));
+    let (mut there, mut gone) = (0, 0);
+    for (found, depth_mm) in places {
+        let pixel = Pixel::new(found.u_px, found.v_px);
+        match sheet_depth_mm(now, pixel, found.diameter_px) {
+            Some(now_mm) if (now_mm - depth_mm).abs() < COVER_OFF_MM => there += 1,
+            _ => gone += 1,
+        }
+    }
+    // never measured before: pulling once more is bounded, leaving it on is not what was asked for
+    if gone > there { PullEnd::Off } else { PullEnd::Stuck }
+}
+
+/// What is a screw once a person has clicked.
+fn clicked_on(shot: &Shot, mut screws: Vec<vision::Screw>, clicks: &[[f64; 2]]) -> Vec<vision::Screw> {
+    for click in clicks {
+        let corner = [f64::from(shot.region.x_px), f64::from(shot.region.y_px)];
+        let pixel = Pixel::new(click[0] - corner[0], click[1] - corner[1]);
+        let near = screws
+            .iter_mut()
+            .filter(|s| s.pixel.distance_px(&pixel) < SAME_HEAD * s.diameter_px)
+            .min_by(|a, b| a.pixel.distance_px(&pixel).total_cmp(&b.pixel.distance_px(&pixel)));
+        match near {
+            Some(screw) => screw.verdict = Verdict::Screw,
+            None => screws.extend(seen_by_a_person(shot, pixel)),
+        }
+    }
+    screws
+}
+
+/// A screw that only a person has seen; `None` without depth there.
+fn seen_by_a_person(shot: &Shot, pixel: Pixel) -> Option<vision::Screw> {
+    let camera = shot.frame.camera?;
+    // how wide it is in the picture depends on how far away it is, which is measured around it
+    let roughly_mm = sheet_depth_mm(&shot.frame, pixel, USUAL_HEAD_PX)?;
+    let around_px = USUAL_HEAD_MM / camera.pixel_mm(roughly_mm).max(1e-6);
+    let depth_mm = sheet_depth_mm(&shot.frame, pixel, around_px)?;
+    Some(vision::Screw {
+        pixel,
+        sigma_px: CLICK_PX,
+        diameter_px: around_px,
+        score: 1.0,
+        fits: 1.0,
+        drive: vision::Drive::Cross,
+        verdict: Verdict::Screw,
+        cues: Vec::new(),
+        angle_rad: None,
+        camera: Some(camera.unproject(pixel, depth_mm)),
+        normal: sheet_normal(&shot.frame, pixel, around_px),
+        top_normal: None,
+        sigma_lateral_mm: Some(CLICK_PX * camera.pixel_mm(depth_mm)),
+        sigma_depth_mm: None,
+    })
+}
