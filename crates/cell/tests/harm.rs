@@ -229,7 +229,7 @@ fn harmed(at: &Path, kind: u32, k: usize, rng: &mut rand_pcg::Pcg64Mcg) -> Harm 
         3 => {
             let mut bytes = settle();
             let last = bytes.len() - PAGE;
-            bytes[last..].fill(if k % 2 == 0 { 0 } else { 0xa5 });
+            bytes[last..].fill([0, 0xa5][k % 2]);
             fs::write(&db, bytes).expect("written");
             harm(format!("last page filled {k}"), false)
         }
