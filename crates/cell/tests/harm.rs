@@ -114,7 +114,7 @@ fn a_full_disk_stops_the_run_before_the_act_and_it_goes_on_when_there_is_room() 
         let (fake, folder) = (Fake::whole(), tempfile::tempdir().expect("folder"));
         let journal = Journal::open(folder.path()).expect("journal");
         journal.limit_pages(room).expect("limited");
-        room += 2;
+        room += 1;
         let Err(error) = block_on(runner(&fake, journal).run_unit(&Silent)) else {
             break;
         };
