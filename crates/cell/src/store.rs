@@ -61,7 +61,11 @@ pub fn keep(folder: &Path, extension: &str, bytes: &[u8]) -> Result<Sha, StoreEr
     };
     if !path.exists() {
         fs::create_dir_all(folder).map_err(|e| failed(e.to_string()))?;
-        geometry::write_aside(&path, bytes).map_err(|e| failed(e.to_string()))?;
+        geometry::write_aside(&path, bytes).map_err(|e| match e {
+            // the path and the advice are said once
+            geometry::FileError::Write { source, .. } => failed(source.to_string()),
+            other => failed(other.to_string()),
+        })?;
         fs::File::open(&path)
             .and_then(|file| file.sync_all())
             .map_err(|e| failed(e.to_string()))?;

@@ -108,7 +108,7 @@ fn a_full_disk_stops_the_run_before_the_act_and_it_goes_on_when_there_is_room() 
         let (fake, folder) = (Fake::whole(), tempfile::tempdir().expect("folder"));
         let journal = Journal::open(folder.path()).expect("journal");
         journal.limit_pages(room).expect("limited");
-        room += 2;
+        room += 1;
         let Err(error) = block_on(runner(&fake, journal).run_unit(&Silent)) else {
             break;
         };
@@ -223,7 +223,7 @@ fn harmed(at: &Path, kind: u32, k: usize, rng: &mut rand_pcg::Pcg64Mcg) -> Harm 
         3 => {
             let mut bytes = settle();
             let last = bytes.len() - PAGE;
-            bytes[last..].fill(if k % 2 == 0 { 0 } else { 0xa5 });
+            bytes[last..].fill([0, 0xa5][k % 2]);
             fs::write(&db, bytes).expect("written");
             harm(format!("last page filled {k}"), false)
         }
