@@ -148,7 +148,11 @@ fn a_plan_keeps_the_contract() {
     assert!(page.contains("<svg") && page.contains("bound"));
     let ended = unscrew(folder.path(), &["plan", "--gap-max", "0"]).status.code();
     assert_eq!(ended, Some(3));
-    std::fs::write(folder.path().join("odd.toml"), "product = \"x\"\nloaded = \"front\"\nscrew = 3\n").expect("written");
+    std::fs::write(
+        folder.path().join("odd.toml"),
+        "product = \"x\"\nloaded = \"front\"\nscrew = 3\n",
+    )
+    .expect("written");
     refused(folder.path(), &["plan", "odd.toml"], &["odd.toml", "screw"]);
 }
 
