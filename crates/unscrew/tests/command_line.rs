@@ -302,6 +302,8 @@ fn a_unit_from_end_to_end() {
     let predictions = stats.as_object_mut().and_then(|s| s.remove("predictions"));
     let predicted = predictions.as_ref().and_then(|p| p[0]["predicted"].as_f64());
     assert!(predicted.is_some_and(|p| (0.0..1.0).contains(&p)), "{predictions:?}");
+    let shifts = stats.as_object_mut().and_then(|s| s.remove("shifts"));
+    assert_eq!(shifts.map(|s| s[0]["units"].clone()), Some(1.into()));
     assert_eq!(stats, summary["statistics"]);
     let told = unscrew(
         at,
