@@ -1,6 +1,5 @@
 //! What the cell does about what goes wrong: other bits, a person's clicks, the mill and who lets it, a hold, an open safety chain.
 
-#[allow(dead_code)] // shared with the other tests
 mod fake;
 
 use cell::config::CellConfig;

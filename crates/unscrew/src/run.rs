@@ -51,10 +51,10 @@ pub struct Args {
     /// Cell file (TOML); left out, the simulated cell
     #[arg(long, value_name = "FILE")]
     cell: Option<PathBuf>,
-    /// A person may be asked to click on screws in pictures (as `click = true` under [help] in the cell file)
+    /// A person may be asked to click on screws in pictures (as `click = true` in table help in the cell file)
     #[arg(long)]
     click: bool,
-    /// Heads may be milled off where product description and plant controller allow it (as `mill = true` under [destructive])
+    /// Heads may be milled off where product description and plant controller allow it (as `mill = true` in table destructive)
     #[arg(long)]
     mill: bool,
     /// Go on with the run in --out, in the middle of a unit if need be
