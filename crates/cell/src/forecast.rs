@@ -195,7 +195,7 @@ impl Default for Assumptions {
                 cover_jams: Chance::Known(0.005),
             },
             screw: ScrewAssumptions {
-                found: Chance::Counted { hits: 1385, of: 1420 },
+                found: Chance::Counted { hits: 692, of: 706 },
                 found_later: Chance::Known(0.5),
                 person_sees: Chance::Known(0.9),
                 out_at_once: Chance::Known(0.96),
