@@ -264,6 +264,14 @@ pub fn odds(config: &CellConfig, purpose: Purpose) -> f64 {
     }
 }
 
+/// The same when a screw is looked at again: what a person has clicked on is not doubted for its picture's sake.
+pub fn odds_again(config: &CellConfig, purpose: Purpose) -> f64 {
+    match purpose {
+        Purpose::Clicked => config.inspection.stuck_cover_odds,
+        other => odds(config, other),
+    }
+}
+
 /// What a second look needs for the record.
 pub fn second_look_of(found: usize, place: Option<&SafeTarget>) -> SecondLook {
     SecondLook {

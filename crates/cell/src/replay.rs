@@ -216,7 +216,7 @@ impl<'a> UnitReplay<'a> {
                 second_look,
                 ..
             } => {
-                let odds = last.map_or(1.0, |face| judge.odds(face.purpose));
+                let odds = last.map_or(1.0, |face| look::odds_again(judge.config, face.purpose));
                 let places = screws.iter().filter_map(|(found, _)| {
                     let find = last?.found.get(*found)?;
                     let (pixel, half_px) = look::place_in_picture(find, &self.camera?, judge.config)?;

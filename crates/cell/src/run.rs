@@ -691,12 +691,14 @@ impl Way<'_> {
     /// How much likelier than pictures say a doubtful head on the face that is being worked on is a screw.
     fn face_odds(&self) -> f64 {
         let purpose = self.record.faces.last().map(|f| f.purpose);
-        purpose.map_or(1.0, |purpose| look::odds(&self.runner.config, purpose))
+        purpose.map_or(1.0, |purpose| look::odds_again(&self.runner.config, purpose))
     }
 
     /// True if a find of the face that is being worked on is a target only because its cover did not come off.
     fn is_doubtful(&self, found: usize) -> bool {
-        let find = self.record.faces.last().and_then(|f| f.found.get(found));
+        // a person's click leaves no doubt
+        let face = self.record.faces.last().filter(|f| f.purpose != Purpose::Clicked);
+        let find = face.and_then(|f| f.found.get(found));
         find.is_some_and(|find| plan::is_doubtful(find.score, self.face_odds()))
     }
 
