@@ -391,14 +391,15 @@ def weather(rng, skin, plating, level, cavity, edge):
     grime = rng.uniform(0.1, 1.0) * (0.25 + level)
     mask = step(0.9, 2.4, skin.fractal(5) + 1.0 * edge + 1.2 * cavity + grime) * min(1, grime)
     skin.cover(0.85 * mask, pick(rng, MUDS), 0.0, 0.85)
-    if plating.endswith("zinc") and rng.random() < 0.2 + 0.5 * level:
+    # white rust of zinc; lime and what other metals shed, on anything
+    if rng.random() < (0.2 + 0.5 * level if plating.endswith("zinc") else 0.08 + 0.3 * level):
         t = 1.9 - 1.5 * level * rng.random()
         mask = step(t, t + 0.7, skin.fractal(2.5) + 0.3 * skin.fractal(0.7))
         skin.cover(mask, (0.55, 0.55, 0.53), 0.0, 0.9, 0.04)
     t = 2.9 + resistance - 3.1 * level * rng.uniform(0.5, 1.15)
     n = 0.9 * skin.fractal(rng.uniform(2, 7)) + 0.4 * skin.fractal(0.8) + 0.5 * edge + 0.5 * cavity
     mask = step(t, t + rng.uniform(0.15, 1.0), n)
-    bumps = 0.05 + 0.05 * skin.fractal(0.7)
+    bumps = rng.uniform(0.03, 0.12) * (1 + skin.fractal(0.7))
     skin.cover(mask, rust_colour(rng, skin.fractal(1.2)), 0.0, 0.92, bumps)
     if rng.random() < 0.5:
         upper = skin.y / (np.abs(skin.y).max() + 1e-6)
@@ -583,11 +584,12 @@ class Pose:
     """How an item sits on the sheet: a small tilt and a lift."""
 
     def __init__(self, rng, x, y, radius, seated):
-        tilt = 0.0 if seated else abs(rng.normal(0, math.radians(2.2)))
-        tilt = min(tilt, math.radians(6))
+        tilt = 0.0 if seated else min(abs(rng.normal(0, math.radians(2.2))), math.radians(6))
+        if not seated and rng.random() < 0.08:
+            tilt = math.radians(rng.uniform(4, 12))
         toward = rng.uniform(0, 6.28)
         self.turn = axis_turn("Z", toward) @ axis_turn("X", tilt) @ axis_turn("Z", -toward)
-        self.lift = rng.uniform(0.3, 3.0) if not seated and rng.random() < 0.25 else 0.0
+        self.lift = rng.uniform(0.3, 3.5) if not seated and rng.random() < 0.25 else 0.0
         self.tilted = tilt > math.radians(2.5)
         self.place = np.array([x, y, self.lift + radius * math.sin(tilt)])
 
@@ -603,7 +605,8 @@ def add_item(parts, pose, x, y, z, skin):
 
 
 def choose_plating(rng):
-    return str(rng.choice(list(PLATINGS), p=[0.2, 0.17, 0.13, 0.12, 0.11, 0.08, 0.06, 0.13]))
+    # black heads are the hardest to read and so come more often than on a unit
+    return str(rng.choice(list(PLATINGS), p=[0.16, 0.16, 0.12, 0.20, 0.10, 0.07, 0.06, 0.13]))
 
 
 def rim_mask(x, y, radius):

@@ -1,6 +1,6 @@
 //! What runs a network: the kernels of this crate, or ONNX Runtime (feature `ort`).
 
-use crate::{Network, NnError, RowSource, Tensor};
+use crate::{Network, NnError, RowSource, Step, Tensor};
 
 /// A network and what runs it.
 #[derive(Clone, Debug)]
@@ -37,6 +37,16 @@ impl Engine {
             ));
         }
         Network::from_bytes(bytes).map(Engine::Own)
+    }
+
+    /// The same run in eight bits where that is possible ([`Network::in_eight_bits`]).
+    #[must_use]
+    pub fn in_eight_bits(self, input: &[Step]) -> Self {
+        match self {
+            Engine::Own(network) => Engine::Own(network.in_eight_bits(input)),
+            #[cfg(feature = "ort")]
+            there => there,
+        }
     }
 
     /// Channels of the input.

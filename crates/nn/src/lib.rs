@@ -30,11 +30,13 @@
 #![cfg_attr(test, allow(clippy::unwrap_used))]
 
 mod conv;
+mod eight;
 mod elementwise;
 mod engine;
 mod error;
 mod file;
 mod kernel;
+mod kernel8;
 mod loss;
 mod network;
 pub mod onnx;
@@ -44,6 +46,7 @@ mod spec;
 mod tensor;
 mod train;
 
+pub use eight::Step;
 pub use engine::Engine;
 pub use error::NnError;
 pub use file::metadata;

@@ -9,8 +9,10 @@ use std::path::Path;
 use rayon::prelude::*;
 
 use crate::conv::{Geometry, pack, stored_channels};
+use crate::eight::{Eight, REACH, Step};
 use crate::file::{Reader, read};
 use crate::kernel::{Level, Start};
+use crate::kernel8::Level8;
 use crate::spec::{NORM_EPSILON, upsample_taps};
 use crate::{LayerSpec, NnError, RowSource, Spec, Tensor};
 
@@ -22,6 +24,8 @@ pub struct Network {
     /// Floats in a stored pixel before each layer and after the last.
     stored: Vec<usize>,
     level: Level,
+    /// What is run instead, where asked for.
+    eight: Option<Eight>,
 }
 
 #[derive(Clone, Debug)]
@@ -31,6 +35,8 @@ pub(crate) enum Layer {
         weights: Vec<f32>,
         bias: Vec<f32>,
         relu: bool,
+        /// How far each output channel reaches, where its normalisation tells.
+        highest: Option<Vec<f32>>,
     },
     MaxPool2,
     Upsample2,
@@ -109,11 +115,16 @@ impl Network {
                     let parameters = parameters.next().unwrap_or_else(|| unreachable!());
                     let (weight, mut bias) = parameters.folded();
                     bias.resize(geometry.outputs, 0.0);
+                    let reach = |norm: &Norm| {
+                        let channels = norm.scale.iter().zip(&norm.shift);
+                        channels.map(|(scale, shift)| shift + REACH * scale.abs()).collect()
+                    };
                     Layer::Conv {
                         geometry,
                         weights: pack(&geometry, channels[index], out, &weight),
                         bias,
                         relu,
+                        highest: parameters.norm.as_ref().map(reach),
                     }
                 }
             });
@@ -123,7 +134,22 @@ impl Network {
             layers,
             stored,
             level,
+            eight: None,
         }
+    }
+
+    /// The same network run in eight bits from now on, several times as fast where the processor has instructions for it; `input` says
+    /// what a byte of each input channel means. The outputs differ a little from those of floats, and are the same to the bit on every
+    /// processor. A network that cannot (one that is no chain of normalised convolutions) stays as it is.
+    #[must_use]
+    pub fn in_eight_bits(mut self, input: &[Step]) -> Self {
+        self.eight = Eight::new(&self, input, Level8::detect());
+        self
+    }
+
+    /// True if it runs in eight bits.
+    pub fn has_eight_bits(&self) -> bool {
+        self.eight.is_some()
     }
 
     /// The output for a whole picture (n = 1), in strips of rows on the rayon pool.
@@ -137,6 +163,10 @@ impl Network {
         // Each strip computes the rows around it again: few strips, but enough to even out the load.
         let halo = self.spec.receptive_field() / self.spec.stride() + 1;
         let strips = (2 * rayon::current_num_threads()).min(h / halo).max(1);
+        if let Some(eight) = &self.eight {
+            self.check_input(source.height(), source.width(), source.channels());
+            return eight.forward(source, strips);
+        }
         self.forward_strips(source, h.div_ceil(strips), h, w)
     }
 
@@ -163,6 +193,9 @@ impl Network {
             return output;
         }
         self.check_input(batch.h, batch.w, batch.c);
+        if let Some(eight) = &self.eight {
+            return eight.forward_batch(batch.n, batch.h, batch.w, |n| Picture { batch, n });
+        }
         output
             .data
             .par_chunks_mut(h * w * output.c)
@@ -184,12 +217,12 @@ impl Network {
         thread_local! {
             static SCRATCH: Cell<Vec<f32>> = const { Cell::new(Vec::new()) };
         }
-        let mut plan = Plan::new(self, source.height(), source.width());
+        let mut plan = Plan::new(&self.spec.layers, &self.stored, source.height(), source.width());
         // Taken, not borrowed: a source that uses rayon itself may start another strip on this thread.
         let mut scratch = SCRATCH.take();
         scratch.clear();
-        scratch.resize(plan.floats, 0.0);
-        plan.start(&self.spec, y0);
+        scratch.resize(plan.values, 0.0);
+        plan.start(&self.spec.layers, y0);
         let channels = self.spec.output_channels();
         let last = plan.rings.len() - 1;
         let (width, stored) = (plan.rings[last].width, self.stored[last]);
@@ -230,41 +263,42 @@ impl RowSource for Picture<'_> {
 }
 
 /// The last rows of one layer's output (ring 0: of the picture), zero pixels left and right.
-struct Ring {
+pub(crate) struct Ring {
     /// Of the whole picture at this layer.
-    height: usize,
-    width: usize,
+    pub height: usize,
+    pub width: usize,
     /// Where the ring begins in the scratch memory.
     start: usize,
     /// Rows it holds.
-    rows: usize,
-    /// Floats in a row.
-    row: usize,
-    /// Floats left of pixel 0.
-    left: usize,
+    pub rows: usize,
+    /// Values in a row.
+    pub row: usize,
+    /// Values left of pixel 0.
+    pub left: usize,
     /// The next row to compute.
-    next: usize,
+    pub next: usize,
 }
 
 impl Ring {
     /// Where pixel 0 of row `y` lies in the scratch memory.
-    fn pixel(&self, y: usize) -> usize {
+    pub(crate) fn pixel(&self, y: usize) -> usize {
         self.start + (y % self.rows) * self.row + self.left
     }
 }
 
 /// The rings of one pass.
-struct Plan {
-    rings: Vec<Ring>,
-    floats: usize,
+pub(crate) struct Plan {
+    pub rings: Vec<Ring>,
+    /// Values in all of them.
+    pub values: usize,
 }
 
 impl Plan {
-    fn new(network: &Network, h: usize, w: usize) -> Self {
-        let layers = &network.spec.layers;
+    /// `stored`: values in a stored pixel before each layer and after the last.
+    pub(crate) fn new(layers: &[LayerSpec], stored: &[usize], h: usize, w: usize) -> Self {
         let mut rings = Vec::with_capacity(layers.len() + 1);
-        let (mut height, mut width, mut floats) = (h, w, 0);
-        for (index, &stored) in network.stored.iter().enumerate() {
+        let (mut height, mut width, mut values) = (h, w, 0);
+        for (index, &stored) in stored.iter().enumerate() {
             let next = layers.get(index);
             let pad = next.map_or(0, LayerSpec::padding);
             let rows = match next {
@@ -276,26 +310,26 @@ impl Plan {
             rings.push(Ring {
                 height,
                 width,
-                start: floats,
+                start: values,
                 rows,
                 row,
                 left: pad * stored,
                 next: 0,
             });
-            floats += rows * row;
+            values += rows * row;
             if let Some(layer) = next {
                 (height, width) = (layer.output_size(height), layer.output_size(width));
             }
         }
-        Self { rings, floats }
+        Self { rings, values }
     }
 
     /// Prepares for output rows from `y` on: finds the first row that each layer needs.
-    fn start(&mut self, spec: &Spec, mut y: usize) {
+    pub(crate) fn start(&mut self, layers: &[LayerSpec], mut y: usize) {
         for index in (0..self.rings.len()).rev() {
             self.rings[index].next = y;
             if index > 0 {
-                y = spec.layers[index - 1].input_rows(y, self.rings[index - 1].height).0;
+                y = layers[index - 1].input_rows(y, self.rings[index - 1].height).0;
             }
         }
     }
@@ -322,6 +356,7 @@ impl Plan {
                     weights,
                     bias,
                     relu,
+                    ..
                 } => {
                     let base = scratch.as_mut_ptr();
                     // SAFETY: the ring holds the rows with the padding that the geometry asks for, and the

@@ -172,6 +172,7 @@ pub fn export(network: &Network) -> Vec<u8> {
                     weights,
                     bias,
                     relu,
+                    ..
                 },
                 LayerSpec::Conv { out, .. },
             ) => {

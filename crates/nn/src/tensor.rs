@@ -58,6 +58,10 @@ pub trait RowSource: Sync {
     fn channels(&self) -> usize;
     /// Writes row `y`, `width * channels` values, channels fastest.
     fn row(&self, y: usize, out: &mut [f32]);
+    /// Row `y` as bytes, where the picture has them and a byte `b` is the value `b * 2 / 255 - 1`.
+    fn bytes(&self, _y: usize) -> Option<&[u8]> {
+        None
+    }
 }
 
 /// The first picture of a tensor.

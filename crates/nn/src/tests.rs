@@ -5,8 +5,10 @@ use std::collections::BTreeMap;
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
+use crate::eight::Eight;
 use crate::kernel::Level;
-use crate::{LayerSpec, Network, NnError, RowSource, Spec, Tensor, Trainer, metadata, softmax_cross_entropy};
+use crate::kernel8::Level8;
+use crate::{LayerSpec, Network, NnError, RowSource, Spec, Step, Tensor, Trainer, metadata, softmax_cross_entropy};
 
 fn conv(kernel: usize, stride: usize, dilation: usize, out: usize, full: bool) -> LayerSpec {
     LayerSpec::Conv {
@@ -388,4 +390,98 @@ fn a_spec_knows_its_geometry() {
     assert_eq!(spec.parameters(), 27 * 16 + 32 + 144 * 32 + 64 + 128 + 4);
     assert_eq!(spec.output_size(9, 8), (3, 2));
     assert_eq!(spec.flops(8, 8), 2 * (16 * 27 * 16 + 16 * 144 * 32 + 4 * 128));
+}
+
+/// Networks as those of `vision` are, with what a byte of their input means: one that ends with an enlargement, one with a dilation.
+fn chains() -> Vec<(Network, Vec<Step>, Tensor)> {
+    let layers = [
+        vec![
+            LayerSpec::conv(5, 2, 1, 16),
+            LayerSpec::conv(3, 2, 1, 24),
+            LayerSpec::conv(3, 1, 2, 40),
+            LayerSpec::Upsample2,
+            LayerSpec::output(2),
+        ],
+        vec![
+            LayerSpec::conv(3, 2, 1, 32),
+            LayerSpec::conv(3, 1, 1, 32),
+            LayerSpec::output(10),
+        ],
+    ];
+    let mut made = Vec::new();
+    for (layers, inputs) in layers.into_iter().zip([3, 4]) {
+        let spec = Spec {
+            input_channels: inputs,
+            layers,
+        };
+        let mut trainer = Trainer::new(spec, 7);
+        let batch = random_tensor(3, 6, 33, 41, inputs);
+        for _ in 0..60 {
+            // so that the running statistics are those of the batch
+            trainer.forward(&batch);
+        }
+        made.push((trainer.network(), vec![Step::between(-1.0, 1.0); inputs], batch));
+    }
+    made
+}
+
+#[test]
+fn eight_bits_say_nearly_what_floats_say() {
+    for (network, input, batch) in chains() {
+        let exact = network.forward_batch(&batch);
+        let network = network.in_eight_bits(&input);
+        assert!(network.has_eight_bits());
+        let eight = network.forward_batch(&batch);
+        assert_eq!(
+            (eight.n, eight.h, eight.w, eight.c),
+            (exact.n, exact.h, exact.w, exact.c)
+        );
+        let mean = exact.data.iter().sum::<f32>() / exact.data.len() as f32;
+        let power = |t: &[f32], by: &dyn Fn(usize) -> f32| {
+            (0..t.len()).map(|i| (t[i] - by(i)).powi(2)).sum::<f32>() / t.len() as f32
+        };
+        let (noise, signal) = (power(&eight.data, &|i| exact.data[i]), power(&exact.data, &|_| mean));
+        assert!(noise < 0.03f32.powi(2) * signal, "noise {noise}, signal {signal}");
+    }
+}
+
+#[test]
+fn eight_bits_are_the_same_on_every_processor_and_in_every_strip() {
+    for (network, input, batch) in chains() {
+        let run = |level: Level8| Eight::new(&network, &input, level).unwrap();
+        let picture = |n: usize| Tensor {
+            n: 1,
+            data: batch.data[batch.index(n, 0, 0)..batch.index(n + 1, 0, 0)].to_vec(),
+            h: batch.h,
+            w: batch.w,
+            c: batch.c,
+        };
+        let whole = run(Level8::Portable).forward_batch(batch.n, batch.h, batch.w, picture);
+        for level in Level8::all() {
+            let eight = run(level);
+            assert_eq!(
+                eight.forward_batch(batch.n, batch.h, batch.w, picture).data,
+                whole.data,
+                "{level:?}"
+            );
+            for strips in [1, 2, 5] {
+                let first = eight.forward(&picture(0), strips);
+                assert_eq!(first.data, whole.data[..first.data.len()], "{level:?} in {strips}");
+            }
+        }
+    }
+}
+
+#[test]
+fn a_network_that_does_not_fit_eight_bits_stays_in_floats() {
+    // the others begin without normalisation, or have layers that are no convolutions
+    for ((spec, ..), fits) in specs().into_iter().zip([true, false, false, false]) {
+        let input = vec![Step::between(-1.0, 1.0); spec.input_channels];
+        let network = Trainer::new(spec, 1).network();
+        let batch = random_tensor(1, 1, 9, 9, 3);
+        let before = network.forward_batch(&batch);
+        let network = network.in_eight_bits(&input);
+        assert_eq!(network.has_eight_bits(), fits);
+        assert_eq!(network.forward_batch(&batch).data == before.data, !fits);
+    }
 }

@@ -51,7 +51,8 @@ impl Evidence {
 }
 
 /// Looks at each place with the first network; where that says that there may be a fastener, the whole ensemble looks at the clip
-/// around the centre that it voted for, and at the three mirror images of it, and the mean decides.
+/// around the centre that it voted for, and at the three mirror images of it, as long as the mean so far still says so; the mean
+/// decides.
 ///
 /// # Arguments
 /// * `networks` – one network is an ensemble too.
@@ -66,18 +67,22 @@ pub fn look(networks: &[Engine], picture: &RgbImage, places: &[Pixel<space::Clip
         return Ok(Vec::new());
     }
     let mut evidence = look_once(&networks[..1], picture, places, VIEWS[0])?;
-    let worth: Vec<usize> = (0..evidence.len())
+    let mut worth: Vec<usize> = (0..evidence.len())
         .filter(|&i| evidence[i].fastener() >= WORTH_MORE)
         .collect();
-    let centers: Vec<_> = worth.iter().map(|&i| evidence[i].center).collect();
-    let mut views = Vec::with_capacity(VIEWS.len());
+    let mut looks: Vec<Vec<Evidence>> = vec![Vec::new(); evidence.len()];
+    let centers: Vec<_> = evidence.iter().map(|e| e.center).collect();
     for sign in VIEWS {
-        views.push(look_once(networks, picture, &centers, sign)?);
-    }
-    for (k, &i) in worth.iter().enumerate() {
-        // a mirror image may have settled on a neighbour
-        let same = |e: &&Evidence| e.center.distance_px(&views[0][k].center) < VOTE_RADIUS * views[0][k].diameter_px;
-        evidence[i] = mean(&views.iter().map(|view| &view[k]).filter(same).collect::<Vec<_>>());
+        let places: Vec<_> = worth.iter().map(|&i| centers[i]).collect();
+        for (&i, look) in worth.iter().zip(look_once(networks, picture, &places, sign)?) {
+            looks[i].push(look);
+            // a mirror image may have settled on a neighbour
+            let first = &looks[i][0];
+            let same = |e: &&Evidence| e.center.distance_px(&first.center) < VOTE_RADIUS * first.diameter_px;
+            evidence[i] = mean(&looks[i].iter().filter(same).collect::<Vec<_>>());
+        }
+        // most of what a first look takes for a fastener off the middle is none once it is in the middle
+        worth.retain(|&i| evidence[i].fastener() >= WORTH_MORE);
     }
     Ok(evidence)
 }

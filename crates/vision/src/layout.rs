@@ -10,7 +10,7 @@
 
 use std::ops::{Range, RangeInclusive};
 
-use nn::{LayerSpec, Spec};
+use nn::{LayerSpec, Spec, Step};
 use serde::{Deserialize, Serialize};
 
 /// Head diameters, px, that the networks are trained for.
@@ -35,6 +35,14 @@ pub const MAP_CELLS: usize = CLIP_PX / STRIDE;
 
 /// Input channels of the fine network: gamma corrected red, green, blue, and the contrast around each pixel.
 pub const FINE_INPUT_CHANNELS: usize = 4;
+
+/// What the networks' inputs mean in eight bits: colour as in the picture, and contrast up to so many standard deviations.
+pub const COARSE_INPUT: [Step; 3] = [Step::between(-1.0, 1.0); 3];
+/// As [`COARSE_INPUT`], for the fine network.
+pub const FINE_INPUT: [Step; FINE_INPUT_CHANNELS] = {
+    let color = Step::between(-1.0, 1.0);
+    [color, color, color, Step::between(-4.0, 4.0)]
+};
 
 /// Number of classes.
 pub const CLASSES: usize = 7;

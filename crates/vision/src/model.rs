@@ -10,7 +10,7 @@ use std::path::Path;
 use nn::{Engine, NnError};
 use serde::{Deserialize, Serialize};
 
-use crate::layout::{COARSE_CHANNELS, FINE_CHANNELS, FINE_INPUT_CHANNELS, STRIDE};
+use crate::layout::{COARSE_CHANNELS, COARSE_INPUT, FINE_CHANNELS, FINE_INPUT, FINE_INPUT_CHANNELS, STRIDE};
 
 const MAGIC: &[u8; 7] = b"UNSCREW";
 /// Version of the container, the eighth byte of the file.
@@ -259,9 +259,9 @@ impl Model {
                 reason,
             })?;
             if is_coarse {
-                coarse = Some(network);
+                coarse = Some(network.in_eight_bits(&COARSE_INPUT));
             } else {
-                fine.push(network);
+                fine.push(network.in_eight_bits(&FINE_INPUT));
             }
         }
         match coarse {

@@ -32,6 +32,11 @@ impl RowSource for Rows<'_> {
             *to = network_value(from);
         }
     }
+
+    fn bytes(&self, y: usize) -> Option<&[u8]> {
+        let row = 3 * self.0.width() as usize;
+        Some(&self.0.as_raw()[y * row..][..row])
+    }
 }
 
 /// A picture at one scale of the pyramid, or a part of it.
