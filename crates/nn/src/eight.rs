@@ -302,16 +302,24 @@ impl Eight {
     /// A row of the picture in bytes.
     fn read(&self, source: &dyn RowSource, y: usize, floats: &mut [f32], out: &mut [u8]) {
         let channels = self.input.len();
-        let pixels = out.chunks_exact_mut(self.stored[0]);
         let color = Step::between(-1.0, 1.0);
         if let Some(bytes) = source.bytes(y).filter(|_| self.input.iter().all(|step| *step == color)) {
-            for (to, from) in pixels.zip(bytes.chunks_exact(channels)) {
-                to[..channels].copy_from_slice(from);
+            match (out.as_chunks_mut::<STEP>(), bytes.as_chunks::<3>()) {
+                // a constant length, or else each pixel is a call
+                ((to, []), (from, [])) if channels == 3 => to
+                    .iter_mut()
+                    .zip(from)
+                    .for_each(|(to, from)| to[..3].copy_from_slice(from)),
+                _ => {
+                    let pixels = out.chunks_exact_mut(self.stored[0]).zip(bytes.chunks_exact(channels));
+                    pixels.for_each(|(to, from)| to[..channels].copy_from_slice(from));
+                }
             }
             return;
         }
         let floats = &mut floats[..source.width() * channels];
         source.row(y, floats);
+        let pixels = out.chunks_exact_mut(self.stored[0]);
         for (to, from) in pixels.zip(floats.chunks_exact(channels)) {
             for ((to, &from), step) in to.iter_mut().zip(from).zip(&self.input) {
                 *to = step.byte(from);

@@ -3,6 +3,7 @@
 use geometry::{Pixel, space};
 use image::RgbImage;
 use nn::{Engine, NnError};
+use rayon::prelude::*;
 
 use crate::Thresholds;
 use crate::components::{Run, area, components};
@@ -50,9 +51,8 @@ pub fn coarse_map(network: &Engine, picture: &RgbImage) -> Result<ProbabilityMap
     }
     let logits = network.forward(&Rows(picture))?;
     // Softmax over two channels is the logistic function of their difference.
-    let probability = logits
-        .data
-        .chunks_exact(COARSE_CHANNELS)
+    let cells = logits.data.par_chunks_exact(COARSE_CHANNELS);
+    let probability = cells
         .map(|cell| 1.0 / (1.0 + (cell[1 - COARSE_FASTENER] - cell[COARSE_FASTENER]).exp()))
         .collect();
     Ok(ProbabilityMap {
@@ -68,12 +68,11 @@ pub fn coarse_map(network: &Engine, picture: &RgbImage) -> Result<ProbabilityMap
 /// The candidates, most probable first.
 pub fn candidates(map: &ProbabilityMap, thresholds: &Thresholds) -> Vec<Candidate> {
     let inside = |x: usize, y: usize| map.probability[y * map.width + x] >= thresholds.coarse; // false for NaN
-    let smooth = smoothed(map);
     let mut found = Vec::new();
     for runs in components(map.width, map.height, inside) {
         let cells = area(&runs);
         if cells >= thresholds.coarse_min_cells.max(1) {
-            peaks(map, &smooth, &runs, cells, &mut found);
+            peaks(map, &runs, cells, &mut found);
         }
     }
     suppress(
@@ -86,11 +85,12 @@ pub fn candidates(map: &ProbabilityMap, thresholds: &Thresholds) -> Vec<Candidat
 }
 
 /// Adds the local maxima of the smoothed probability in a component.
-fn peaks(map: &ProbabilityMap, smooth: &[f32], runs: &[Run], cells: usize, found: &mut Vec<Candidate>) {
+fn peaks(map: &ProbabilityMap, runs: &[Run], cells: usize, found: &mut Vec<Candidate>) {
     let first = found.len();
+    let smooth = |x: usize, y: usize| smoothed(map, x, y);
     for run in runs {
         for x in run.start..run.end {
-            let here = smooth[run.y * map.width + x];
+            let here = smooth(x, run.y);
             let mut highest = true;
             for dy in -1..=1i64 {
                 for dx in -1..=1i64 {
@@ -98,7 +98,7 @@ fn peaks(map: &ProbabilityMap, smooth: &[f32], runs: &[Run], cells: usize, found
                     if (dx, dy) == (0, 0) || nx < 0 || ny < 0 || nx >= map.width as i64 || ny >= map.height as i64 {
                         continue;
                     }
-                    let there = smooth[ny as usize * map.width + nx as usize];
+                    let there = smooth(nx as usize, ny as usize);
                     // On a plateau the last cell wins, so that there is exactly one.
                     highest &= there < here || (there == here && (dy, dx) < (0, 0));
                 }
@@ -119,27 +119,10 @@ fn peaks(map: &ProbabilityMap, smooth: &[f32], runs: &[Run], cells: usize, found
 }
 
 /// Mean over 5 x 5 cells; beyond the border there is nothing.
-fn smoothed(map: &ProbabilityMap) -> Vec<f32> {
-    const REACH: usize = 2;
-    let (width, height) = (map.width, map.height);
-    let mut across = vec![0f32; map.probability.len()];
-    for (to, from) in across
-        .chunks_exact_mut(width.max(1))
-        .zip(map.probability.chunks_exact(width.max(1)))
-    {
-        for (x, to) in to.iter_mut().enumerate() {
-            *to = from[x.saturating_sub(REACH)..(x + REACH + 1).min(width)].iter().sum();
-        }
-    }
-    let mut smooth = vec![0f32; across.len()];
-    for (y, to) in smooth.chunks_exact_mut(width.max(1)).enumerate() {
-        for row in y.saturating_sub(REACH)..(y + REACH + 1).min(height) {
-            for (to, from) in to.iter_mut().zip(&across[row * width..]) {
-                *to += from / 25.0;
-            }
-        }
-    }
-    smooth
+fn smoothed(map: &ProbabilityMap, x: usize, y: usize) -> f32 {
+    let mut sum = 0.0;
+    for_square(map, x, y, 2, |_, _, p| sum += p);
+    sum / 25.0
 }
 
 /// Probability-weighted centroid of the cells around a peak.

@@ -22,6 +22,8 @@ use crate::{Model, ModelError};
 
 /// Two finds nearer than this, in head diameters, are the same fastener.
 const SAME: f64 = 0.5;
+/// So many candidates, screws or not, have a say in where a face looks.
+const ENOUGH_HEADS: usize = 24;
 /// Heads so much smaller or larger than asked for are still reported.
 const HEAD_TOLERANCE: f64 = 1.5;
 
@@ -236,6 +238,15 @@ struct Find {
     evidence: Evidence,
 }
 
+/// What a find is taken for.
+#[derive(Clone, Copy)]
+struct Told {
+    verdict: Verdict,
+    drive: Drive,
+    score: f64,
+    fits: f64,
+}
+
 impl Detector {
     /// With a model from a file.
     ///
@@ -330,14 +341,19 @@ impl Detector {
         finds.retain(|f| region.contains(f.pixel) && heads.contains(&f.diameter_px));
         let finds = merge(finds);
         let start = Instant::now();
-        let mut screws: Vec<Screw> = finds
+        let told: Vec<Option<Told>> = finds.iter().map(|find| self.tell(find, options)).collect();
+        // the likeliest come first
+        let last = told.iter().rposition(Option::is_some).map_or(0, |last| last + 1);
+        let around = finds.len().min(last.max(ENOUGH_HEADS));
+        let mut screws: Vec<Screw> = finds[..around]
             .par_iter()
-            .zip(sheet_normals(&finds, space))
-            .filter_map(|(find, normal)| {
+            .zip(told)
+            .zip(sheet_normals(&finds[..around], space))
+            .filter_map(|((find, told), normal)| {
                 let parallax_px = space.zip(normal).map_or([0.0; 2], |((_, camera), normal)| {
                     parallax_px(camera, find.pixel, normal, find.diameter_px)
                 });
-                let screw = self.decide(picture, find, options, parallax_px)?;
+                let screw = self.measure(picture, find, told?, parallax_px)?;
                 Some(Screw { normal, ..screw })
             })
             .collect();
@@ -412,8 +428,8 @@ impl Detector {
         Ok(evidence.into_iter().map(in_image).collect())
     }
 
-    /// Verdict, drive and centre of a find; `None` where it is nothing.
-    fn decide(&self, picture: &RgbImage, find: &Find, options: &Options, parallax_px: [f64; 2]) -> Option<Screw> {
+    /// Verdict and drive of a find; `None` where it is nothing.
+    fn tell(&self, find: &Find, options: &Options) -> Option<Told> {
         let settings = &self.model.settings;
         let probability = |drive: Drive| drive.class().map_or(0.0, |c| f64::from(find.evidence.of(c)));
         let calibrated = |p: f64| settings.corrections.probability(p);
@@ -440,6 +456,22 @@ impl Detector {
         } else {
             return None;
         };
+        Some(Told {
+            verdict,
+            drive,
+            score,
+            fits,
+        })
+    }
+
+    /// Centre of a find by all cues; `None` where it has none.
+    fn measure(&self, picture: &RgbImage, find: &Find, told: Told, parallax_px: [f64; 2]) -> Option<Screw> {
+        let Told {
+            verdict,
+            drive,
+            score,
+            fits,
+        } = told;
         let learned = CueCenter {
             pixel: find.pixel,
             sigma_px: find.sigma_px,
@@ -448,7 +480,13 @@ impl Detector {
         let crossed = (drive == Drive::Cross || drive == Drive::Unknown)
             .then(|| cross(picture, find.pixel, find.diameter_px))
             .flatten();
-        let fused = fuse(Some(learned), circle, crossed, parallax_px, &settings.corrections)?;
+        let fused = fuse(
+            Some(learned),
+            circle,
+            crossed,
+            parallax_px,
+            &self.model.settings.corrections,
+        )?;
         let used = |cue| fused.cues.contains(&cue);
         Some(Screw {
             pixel: fused.center.pixel,
@@ -489,7 +527,7 @@ impl Detector {
     }
 }
 
-/// Which way the sheet looks around each find, where there is depth. Every candidate has a say in where the face looks, screw or not.
+/// Which way the sheet looks around each find, where there is depth. Candidates have a say in where the face looks, screw or not.
 fn sheet_normals(finds: &[Find], space: Option<(&DepthMap, &CameraModel)>) -> Vec<Option<Direction<Camera>>> {
     let Some((depth, camera)) = space else {
         return vec![None; finds.len()];
@@ -555,15 +593,14 @@ mod tests {
         let mut model = detector.model().clone();
         model.settings = crate::Settings::default();
         let detector = Detector::new(model);
-        let picture = RgbImage::from_pixel(100, 100, image::Rgb([90; 3]));
         let verdict = |cross, slotted, bit| {
             let options = Options {
                 bit,
                 ..Options::default()
             };
             detector
-                .decide(&picture, &find(50.0, 30.0, cross, slotted), &options, [0.0; 2])
-                .map(|s| (s.verdict, s.drive))
+                .tell(&find(50.0, 30.0, cross, slotted), &options)
+                .map(|told| (told.verdict, told.drive))
         };
         assert_eq!(verdict(0.95, 0.0, Drive::Cross), Some((Verdict::Screw, Drive::Cross)));
         assert_eq!(verdict(0.95, 0.0, Drive::Slotted), Some((Verdict::Other, Drive::Cross)));

@@ -9,8 +9,9 @@ use serde::{Deserialize, Serialize};
 
 use crate::Region;
 
-/// Every so many rows and columns are looked at.
+/// Every so many rows and columns are looked at, and fewer where more than so many would be.
 const LINE_STEP: u32 = 12;
+const MOST_LINES: u32 = 125;
 /// Widths of the two derivatives of Gaussians that an edge is measured with, px.
 const FILTERS_PX: [f64; 2] = [1.0, 3.0];
 /// Taps on each side of the wider filter.
@@ -116,7 +117,10 @@ impl Lines {
             [r.min(g).min(b), r.max(g).max(b)]
         };
         let (us, vs) = (region.u_px..right, region.v_px..bottom);
-        let every = |range: std::ops::Range<u32>| range.skip(LINE_STEP as usize / 2).step_by(LINE_STEP as usize);
+        let every = |range: std::ops::Range<u32>| {
+            let step = (range.len() as u32 / MOST_LINES).max(LINE_STEP) as usize;
+            range.skip(step / 2).step_by(step)
+        };
         Self {
             rows: every(vs.clone())
                 .map(|v| us.clone().map(|u| value(u, v)).collect())
