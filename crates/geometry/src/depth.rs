@@ -76,6 +76,8 @@ impl DepthMap {
 
 /// Fewest agreeing measurements for a plane that may be trusted.
 const MIN_INLIERS: usize = 12;
+/// Points at most that a median is taken over.
+const MEDIAN_POINTS: usize = 160;
 
 fn fit_plane(points: &[[f64; 3]]) -> Option<SurfaceSample> {
     if points.len() < MIN_INLIERS {
@@ -84,7 +86,9 @@ fn fit_plane(points: &[[f64; 3]]) -> Option<SurfaceSample> {
     // Start from the plane of a few spread triples with the smallest median deviation: withstands up to half outliers (edges).
     let n = points.len();
     let mut best: Option<(f64, [f64; 3])> = None;
-    let mut scratch = Vec::with_capacity(n);
+    // A part of the points tells as well which plane is best.
+    let part = n.div_ceil(MEDIAN_POINTS);
+    let mut scratch = Vec::with_capacity(MEDIAN_POINTS);
     for k in 0..48usize {
         // a fixed low-discrepancy walk through the triples keeps the result deterministic
         let pick = |m: f64| (((k as f64 + 0.5) * m).fract() * n as f64) as usize;
@@ -95,8 +99,8 @@ fn fit_plane(points: &[[f64; 3]]) -> Option<SurfaceSample> {
         ];
         let Some(plane) = through(&triple) else { continue };
         scratch.clear();
-        scratch.extend(points.iter().map(|p| residual(&plane, p).abs()));
-        let mid = n / 2;
+        scratch.extend(points.iter().step_by(part).map(|p| residual(&plane, p).abs()));
+        let mid = scratch.len() / 2;
         let (_, median, _) = scratch.select_nth_unstable_by(mid, f64::total_cmp);
         if best.as_ref().is_none_or(|(m, _)| *median < *m) {
             best = Some((*median, plane));

@@ -42,6 +42,8 @@ pub struct Sensor {
     pub depth_noise_mm: f32,
     /// Slowly varying error of the depth camera, mm.
     pub depth_bias_mm: f32,
+    /// Half side of stereo's matching window, in its own pixels: all that it sees counts as one depth.
+    pub depth_window_px: i64,
     /// Seed of that error: belongs to the camera, not to the exposure.
     pub depth_seed: u64,
     /// Seed of this exposure's noise.
@@ -74,6 +76,7 @@ impl Sensor {
             depth_bias_mm: rng.random_range(0.1..0.35),
             depth_seed: rng.random(),
             noise_seed: rng.random(),
+            depth_window_px: rng.random_range(0..=3),
         }
     }
 }
@@ -526,6 +529,7 @@ impl DepthEye<'_> {
         if !self.real {
             return z;
         }
+        let seen = self.window(store, x, y, z);
         let light = 0.25 * light * s.exposure;
         let mut spread = 0.0f32;
         for (dx, dy) in [(-3, 0), (4, 0), (0, -3), (0, 4), (-2, -2), (3, -2), (-2, 3), (3, 3)] {
@@ -555,7 +559,24 @@ impl DepthEye<'_> {
         let bias = s.depth_bias_mm
             * (2.0 * smooth_noise(s.depth_seed, i as f32 / 420.0, j as f32 / 420.0) - 1.0
                 + 0.5 * (2.0 * smooth_noise(s.depth_seed ^ 1, i as f32 / 130.0, j as f32 / 130.0) - 1.0));
-        z + noise + bias
+        seen + noise + bias
+    }
+
+    /// Mean depth of what the matching window sees, without what lies far before or behind: matching keeps to steep edges.
+    fn window(&self, store: &Store, x: i64, y: i64, z: f32) -> f32 {
+        const SAME_MM: f32 = 8.0;
+        let half = self.sensor.depth_window_px;
+        let (mut sum, mut n) = (z, 1.0);
+        for dy in (-half..=half).filter(|_| half > 0) {
+            for dx in -half..=half {
+                let there = store.depth(x + 2 * dx, y + 2 * dy);
+                if (there - z).abs() < SAME_MM {
+                    sum += there;
+                    n += 1.0;
+                }
+            }
+        }
+        sum / n
     }
 }
 

@@ -2,14 +2,14 @@
 
 use crate::face::{Shot, face_of, shot};
 use geometry::Pixel;
-use nalgebra::{Matrix3, Vector3};
+use nalgebra::{Matrix3, SMatrix, SVector, Vector3};
 use nn::NnError;
 use scene::Unit;
 use serde::{Deserialize, Serialize};
 use vision::layout::Class;
 use vision::{
-    Corrections, CueCenter, Detector, Evidence, Model, Options, Screw, Settings, Thresholds, Verdict, candidates,
-    coarse_map, cross, facings, locate, look, outer_circle, parallax_px,
+    Corrections, CueCenter, Detector, Evidence, Model, Options, RIM_TERMS, RimProfile, Screw, Settings, Thresholds,
+    Verdict, candidates, coarse_map, cross, facings, look, outer_circle, parallax_px,
 };
 
 /// Share of a normal distribution within one sigma.
@@ -72,7 +72,7 @@ pub fn tune(model: &Model, first_seed: u64, faces: u64, done: &dyn Fn(u64)) -> R
     };
     let detector = with(model, open);
     let (mut scores, mut unfound, mut screws) = (Vec::new(), 0, 0);
-    let (mut ratios, mut depths) = (Vec::new(), [Vec::new(), Vec::new()]);
+    let (mut ratios, mut rims) = (Vec::new(), Vec::new());
     for shot in kept.into_iter().chain(shots) {
         let found = detector.detect(&shot.frame, &Options::default()).screws;
         screws += shot.truth.screws.iter().filter(|s| s.detectable).count();
@@ -89,15 +89,12 @@ pub fn tune(model: &Model, first_seed: u64, faces: u64, done: &dyn Fn(u64)) -> R
             let (Some(depth), Some(camera)) = (&shot.frame.depth, &shot.frame.camera) else {
                 continue;
             };
-            let at = locate(depth, camera, find.pixel, find.sigma_px, find.diameter_px, &corrections);
-            if let Some(at) = at {
-                let head_mm = find.diameter_px * camera.pixel_mm(at.point.z_mm());
-                depths[at.source as usize].push(DepthError {
-                    too_far_mm: at.point.z_mm() - truth.point.z_mm(),
-                    head_mm: head_mm * at.normal.vector().z.abs(),
-                    sigma_mm: at.sigma_depth_mm,
-                });
-            }
+            rims.extend(
+                RimProfile::of(depth, camera, find.pixel, find.diameter_px).map(|profile| Rim {
+                    height_mm: profile.sheet.depth_mm - truth.point.z_mm(),
+                    profile,
+                }),
+            );
         }
         for find in found.iter().filter(|s| s.verdict != Verdict::Other) {
             let near = |s: &&scene::ScrewTruth| s.pixel.distance_px(&find.pixel) < 0.5 * s.head_d_px;
@@ -107,16 +104,7 @@ pub fn tune(model: &Model, first_seed: u64, faces: u64, done: &dyn Fn(u64)) -> R
         }
     }
     corrections.fused_sigma *= one_sigma(ratios);
-    let mut depth_ratios = Vec::new();
-    for (rise, errors) in corrections.depth_rise.iter_mut().zip(&depths) {
-        *rise = median(errors.iter().map(|e| e.too_far_mm / e.head_mm).collect());
-        depth_ratios.extend(
-            errors
-                .iter()
-                .map(|e| (e.too_far_mm - *rise * e.head_mm).abs() / e.sigma_mm),
-        );
-    }
-    corrections.depth_sigma *= one_sigma(depth_ratios);
+    rim_heights(&rims, &mut corrections);
     corrections.score = calibration(&scores);
     for (score, _) in &mut scores {
         *score = corrections.probability(*score);
@@ -137,10 +125,11 @@ pub fn tune(model: &Model, first_seed: u64, faces: u64, done: &dyn Fn(u64)) -> R
     })
 }
 
-struct DepthError {
-    too_far_mm: f64,
-    head_mm: f64,
-    sigma_mm: f64,
+/// A recess rim in the depth of a face.
+struct Rim {
+    profile: RimProfile,
+    /// Its true height above the sheet as measured, mm.
+    height_mm: f64,
 }
 
 fn with(model: &Model, settings: Settings) -> Detector {
@@ -240,6 +229,39 @@ fn cue_factors(model: &Model, shots: &[Shot], corrections: &mut Corrections) -> 
     (corrections.learned_sigma, corrections.cross_sigma) =
         (one_sigma(rest(0, &|e| e.sigma_px)), one_sigma(rest(2, &|e| e.sigma_px)));
     Ok(())
+}
+
+/// Weights of what stereo measures around a recess, and how far the rim's true height is off what they give.
+fn rim_heights(rims: &[Rim], corrections: &mut Corrections) {
+    if rims.len() < ENOUGH {
+        return;
+    }
+    let usual = SVector::<f64, RIM_TERMS>::from(corrections.rim_height);
+    let mut weights = usual;
+    let off = |rim: &Rim, weights: &SVector<f64, RIM_TERMS>| rim.height_mm - rim.profile.height_mm(&(*weights).into());
+    for _ in 0..20 {
+        let scale = 1.4826 * median(rims.iter().map(|rim| off(rim, &weights).abs()).collect());
+        // what the heads leave open stays as usual
+        let mut square = SMatrix::<f64, RIM_TERMS, RIM_TERMS>::identity();
+        let mut right = usual;
+        for rim in rims {
+            // errors beyond twice the scale count linearly (Huber 1964)
+            let weight = (2.0 * scale / off(rim, &weights).abs().max(1e-9)).min(1.0);
+            let terms = SVector::from(rim.profile.terms);
+            square += weight * terms * terms.transpose();
+            right += weight * rim.height_mm * terms;
+        }
+        let Some(inverse) = square.try_inverse() else { return };
+        weights = inverse * right;
+    }
+    let head_mm = |rim: &Rim| rim.profile.terms[RIM_TERMS - 1];
+    let spread = |of: &dyn Fn(&Rim) -> f64| 1.4826 * median(rims.iter().map(|rim| of(rim).abs()).collect());
+    corrections.rim_height = weights.into();
+    corrections.rim_spread = spread(&|rim| off(rim, &weights) / head_mm(rim));
+    let ratio = |rim: &Rim| off(rim, &weights).abs() / rim.profile.sigma_mm(corrections.rim_spread);
+    corrections.depth_sigma = one_sigma(rims.iter().map(ratio).collect());
+    let usual = median(rims.iter().map(|rim| rim.height_mm / head_mm(rim)).collect());
+    corrections.usual_height = [usual, spread(&|rim| rim.height_mm / head_mm(rim) - usual)];
 }
 
 /// How far below the rim a cue rests, in head diameters: least squares over all but the gross errors.

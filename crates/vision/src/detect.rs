@@ -15,7 +15,7 @@ use crate::center::{Cue, CueCenter, cross, fuse, outer_circle};
 use crate::coarse::{candidates, coarse_map, suppress};
 use crate::fine::{Evidence, look};
 use crate::layout::{CLIP_PX, Class, STRIDE};
-use crate::locate::{DepthSource, facings, locate, parallax_px};
+use crate::locate::{facings, locate, parallax_px};
 use crate::picture::{Level, pyramid_scales};
 use crate::quality::{Doubt, doubts};
 use crate::{Model, ModelError};
@@ -520,7 +520,7 @@ impl Detector {
             corrections,
         );
         screw.camera = found.map(|f| f.point);
-        screw.top_normal = found.filter(|f| f.source == DepthSource::Head).map(|f| f.normal);
+        screw.top_normal = found.and_then(|f| f.top_normal);
         screw.normal = screw.normal.or(found.map(|f| f.normal));
         screw.sigma_lateral_mm = found.map(|f| f.sigma_lateral_mm);
         screw.sigma_depth_mm = found.map(|f| f.sigma_depth_mm);

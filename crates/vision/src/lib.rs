@@ -48,7 +48,7 @@ pub use clip::Clip;
 pub use coarse::{Candidate, ProbabilityMap, candidates, coarse_map};
 pub use detect::{Detections, Detector, Drive, Options, Region, Screw, Timing, Verdict};
 pub use fine::{Evidence, look};
-pub use locate::{DepthSource, Located, facings, locate, parallax_px};
+pub use locate::{DepthSource, Located, RIM_TERMS, RimProfile, facings, locate, parallax_px};
 pub use marker::{LocatedMarker, Marker, MarkerError, MarkerSpec, find_marker, locate_marker};
 pub use model::{
     Corrections, EMBEDDED_MODEL, Model, ModelError, Settings, Thresholds, decode_model, encode_model, model_id,

@@ -6,14 +6,18 @@ use rayon::prelude::*;
 
 use crate::Corrections;
 
-/// The ring of the head's top around the recess, in head diameters: what lies inside is biased by the slot's floor.
+/// The ring of the head's top around the recess, in head diameters.
 const TOP_RING: [f64; 2] = [0.24, 0.36];
-/// Height of the rim above that ring, in head diameters, and its spread: most heads are a little domed.
-const DOME: [f64; 2] = [0.02, 0.015];
 /// The ring of sheet around the head, in head diameters.
 const SHEET_RING: [f64; 2] = [0.75, 1.6];
-/// Height of the recess rim above the sheet, in head diameters, and its spread: pan, truss, binding, washer and flange heads.
-const RIM_HEIGHT: [f64; 2] = [0.27, 0.09];
+/// Borders of the rings around the recess whose heights above the sheet tell the rim's, in head diameters.
+const RINGS: [f64; 8] = [0.0, 0.12, 0.20, 0.27, 0.34, 0.41, 0.48, 0.56];
+/// Heights in those rings, and the head's diameter.
+pub const RIM_TERMS: usize = RINGS.len();
+/// Weights of these where nothing was measured: the top around the recess, a little domed.
+pub(crate) const USUAL_RIM: [f64; RIM_TERMS] = [0.0, 0.0, 0.5, 0.5, 0.0, 0.0, 0.0, 0.02];
+/// Rings that must have depth of their own; the others are filled from their neighbours.
+const RINGS_SEEN: usize = 5;
 /// The slope that a face in front of the camera can have: steeper planes come from an edge.
 const STEEPEST: f64 = 1.0;
 /// Stereo errors of neighbouring measurements go together: so many count as one.
@@ -23,13 +27,13 @@ const STEEPEST_SHEET: f64 = 0.5;
 /// Angle to the other heads' sheet beyond which it has too, rad.
 const SAME_SHEET: f64 = 0.12;
 
-/// What a depth rests on; the value is its place in [`Corrections::depth_rise`].
+/// What a depth rests on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum DepthSource {
-    /// The head's top around the recess.
-    Head = 0,
+    /// How high the head rises above the sheet, ring by ring.
+    Head,
     /// The sheet around the head, and the usual height of heads.
-    Sheet = 1,
+    Sheet,
 }
 
 /// A screw in space.
@@ -41,8 +45,10 @@ pub struct Located {
     pub sigma_depth_mm: f64,
     /// Standard error across it, along each axis, mm.
     pub sigma_lateral_mm: f64,
-    /// Normal of the surface there, towards the camera.
+    /// Normal of the sheet around it, towards the camera.
     pub normal: Direction<Camera>,
+    /// Normal of the head's top, where it has enough depth of its own.
+    pub top_normal: Option<Direction<Camera>>,
     /// What the depth rests on.
     pub source: DepthSource,
 }
@@ -63,36 +69,99 @@ pub fn locate(
     diameter_px: f64,
     corrections: &Corrections,
 ) -> Option<Located> {
-    let ring = |[inner, outer]: [f64; 2]| {
-        depth
-            .plane_at(pixel, inner * diameter_px, outer * diameter_px)
-            .filter(|plane| believable(plane, camera, pixel))
+    let [inner, outer] = SHEET_RING.map(|r| r * diameter_px);
+    let sheet = depth
+        .plane_at(pixel, inner, outer)
+        .filter(|plane| believable(plane, camera, pixel))?;
+    let head_mm = diameter_px * camera.pixel_mm(sheet.depth_mm);
+    let profile = RimProfile::above(sheet, depth, pixel, head_mm, diameter_px);
+    let (height_mm, sigma_depth_mm, source) = match &profile {
+        Some(profile) => (
+            profile.height_mm(&corrections.rim_height),
+            profile.sigma_mm(corrections.rim_spread) * corrections.depth_sigma,
+            DepthSource::Head,
+        ),
+        None => {
+            let [height, spread] = corrections.usual_height;
+            (
+                height * head_mm,
+                noise_mm(&sheet).hypot(spread * head_mm),
+                DepthSource::Sheet,
+            )
+        }
     };
-    let noise = |plane: &SurfaceSample| plane.sigma_mm * MEASUREMENTS_A_SAMPLE.sqrt();
-    // Depth of the rim from that of a ring's plane: (rise, spread) in head diameters, along the normal.
-    let rim = |plane: SurfaceSample, [rise, spread]: [f64; 2], source| {
-        let head_mm = diameter_px * camera.pixel_mm(plane.depth_mm);
-        let normal = normal(&plane, camera, pixel)?;
-        let depth_mm = plane.depth_mm - rise * head_mm * normal.vector().z.abs();
-        Some((plane, depth_mm, spread * head_mm, normal, source))
-    };
-    let more = |[rise, spread]: [f64; 2], source| [rise + corrections.depth_rise[source as usize], spread];
-    let top = || rim(ring(TOP_RING)?, more(DOME, DepthSource::Head), DepthSource::Head);
-    let sheet = || {
-        rim(
-            ring(SHEET_RING)?,
-            more(RIM_HEIGHT, DepthSource::Sheet),
-            DepthSource::Sheet,
-        )
-    };
-    let (plane, depth_mm, spread_mm, normal, source) = top().or_else(sheet)?;
+    let depth_mm = sheet.depth_mm - height_mm;
+    let [inner, outer] = TOP_RING.map(|r| r * diameter_px);
+    let top = depth
+        .plane_at(pixel, inner, outer)
+        .filter(|plane| believable(plane, camera, pixel));
     Some(Located {
         point: camera.unproject(pixel, depth_mm),
-        sigma_depth_mm: noise(&plane).hypot(spread_mm) * corrections.depth_sigma,
+        sigma_depth_mm,
         sigma_lateral_mm: sigma_px * camera.pixel_mm(depth_mm),
-        normal,
+        normal: normal(&sheet, camera, pixel)?,
+        top_normal: top.and_then(|top| normal(&top, camera, pixel)),
         source,
     })
+}
+
+/// How high a head rises above the sheet around it, ring by ring.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct RimProfile {
+    /// The sheet around the head.
+    pub sheet: SurfaceSample,
+    /// Median height in each ring, mm along the optical axis, then the head's diameter, mm.
+    pub terms: [f64; RIM_TERMS],
+}
+
+impl RimProfile {
+    /// That of a head of this diameter; `None` where the sheet or most rings have no depth.
+    pub fn of(depth: &DepthMap, camera: &CameraModel, pixel: Pixel, diameter_px: f64) -> Option<Self> {
+        let [inner, outer] = SHEET_RING.map(|r| r * diameter_px);
+        let sheet = depth.plane_at(pixel, inner, outer)?;
+        let head_mm = diameter_px * camera.pixel_mm(sheet.depth_mm);
+        Self::above(sheet, depth, pixel, head_mm, diameter_px).filter(|_| believable(&sheet, camera, pixel))
+    }
+
+    fn above(sheet: SurfaceSample, depth: &DepthMap, pixel: Pixel, head_mm: f64, diameter_px: f64) -> Option<Self> {
+        let mut rings: [Vec<f64>; RIM_TERMS - 1] = Default::default();
+        for [u, v, z] in depth.neighbourhood(pixel, 0.0, RINGS[RIM_TERMS - 1] * diameter_px) {
+            let r = u.hypot(v) / diameter_px;
+            if let Some(ring) = RINGS.windows(2).position(|border| (border[0]..border[1]).contains(&r)) {
+                let plane = sheet.depth_mm + sheet.slope_mm_per_px[0] * u + sheet.slope_mm_per_px[1] * v;
+                rings[ring].push(plane - z);
+            }
+        }
+        let heights = rings.map(|mut heights| {
+            let middle = heights.len() / 2;
+            (!heights.is_empty()).then(|| *heights.select_nth_unstable_by(middle, f64::total_cmp).1)
+        });
+        if heights.iter().flatten().count() < RINGS_SEEN {
+            return None;
+        }
+        let mut terms = [head_mm; RIM_TERMS];
+        for (ring, term) in terms[..RIM_TERMS - 1].iter_mut().enumerate() {
+            // the nearest ring that was seen, of two the outer one
+            let seen = (0..heights.len()).filter(|&k| heights[k].is_some());
+            *term = heights[seen.min_by_key(|&k| (k.abs_diff(ring), k < ring))?]?;
+        }
+        Some(Self { sheet, terms })
+    }
+
+    /// Height of the rim above the sheet, mm along the optical axis, by weights as those of [`Corrections::rim_height`].
+    pub fn height_mm(&self, weights: &[f64; RIM_TERMS]) -> f64 {
+        self.terms.iter().zip(weights).map(|(term, weight)| term * weight).sum()
+    }
+
+    /// Standard error of that height where it spreads so much, in head diameters, mm.
+    pub fn sigma_mm(&self, spread: f64) -> f64 {
+        noise_mm(&self.sheet).hypot(spread * self.terms[RIM_TERMS - 1])
+    }
+}
+
+/// Standard error of a sheet's depth, mm.
+fn noise_mm(sheet: &SurfaceSample) -> f64 {
+    sheet.sigma_mm * MEASUREMENTS_A_SAMPLE.sqrt()
 }
 
 /// Which way the sheet looks around each of several heads on one face, towards the camera: the plane of the ring around the head, which is

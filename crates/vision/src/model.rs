@@ -11,6 +11,7 @@ use nn::{Engine, NnError};
 use serde::{Deserialize, Serialize};
 
 use crate::layout::{COARSE_CHANNELS, COARSE_INPUT, FINE_CHANNELS, FINE_INPUT, FINE_INPUT_CHANNELS, STRIDE};
+use crate::locate::{RIM_TERMS, USUAL_RIM};
 
 const MAGIC: &[u8; 7] = b"UNSCREW";
 /// Version of the container, the eighth byte of the file.
@@ -67,9 +68,13 @@ pub struct Corrections {
     pub learned_sigma: f64,
     /// True error over stated sigma of the fused centre.
     pub fused_sigma: f64,
-    /// How much nearer to the camera a rim is than depth measured on the head's top and on the sheet around it say, in head
-    /// diameters: stereo's window sees slot, flank and sheet with the rim.
-    pub depth_rise: [f64; 2],
+    /// Height of the rim above the sheet from what stereo measures there: weights of the heights in rings around the recess, from the
+    /// inside out, and of the head's diameter. Its window sees slot, flank and sheet with the rim.
+    pub rim_height: [f64; RIM_TERMS],
+    /// Spread of the rim's true height around that, in head diameters.
+    pub rim_spread: f64,
+    /// The rim's usual height above the sheet and its spread, in head diameters: where the head itself has no depth.
+    pub usual_height: [f64; 2],
     /// True error over stated sigma of the depth at the rim.
     pub depth_sigma: f64,
     /// What makes a probability `p` of the networks true: its log odds are `a ln p - b ln(1 - p) + c` (beta calibration, Kull, Silva
@@ -96,7 +101,9 @@ impl Default for Corrections {
             cross_sigma: 1.0,
             learned_sigma: 1.0,
             fused_sigma: 1.0,
-            depth_rise: [0.0; 2],
+            rim_height: USUAL_RIM,
+            rim_spread: 0.03,
+            usual_height: [0.27, 0.09], // pan, truss, binding, washer and flange heads
             depth_sigma: 1.0,
             score: [1.0, 1.0, 0.0],
         }
