@@ -6,10 +6,10 @@ use nalgebra::{Matrix3, SMatrix, SVector, Vector3};
 use nn::NnError;
 use scene::Unit;
 use serde::{Deserialize, Serialize};
-use vision::layout::Class;
+use vision::layout::{Class, STRIDE};
 use vision::{
-    Corrections, CueCenter, Detector, Evidence, Model, Options, RIM_TERMS, RimProfile, Screw, Settings, Thresholds,
-    Verdict, candidates, coarse_map, cross, facings, look, outer_circle, parallax_px,
+    Corrections, CueCenter, Detector, Evidence, Model, Options, ProbabilityMap, RIM_TERMS, RimProfile, Screw, Settings,
+    Thresholds, Verdict, candidates, coarse_map, cross, facings, look, outer_circle, parallax_px,
 };
 
 /// Share of a normal distribution within one sigma.
@@ -23,6 +23,9 @@ const GROSS: f64 = 0.15;
 /// Scores below this are left out of the calibration: hundreds of candidates that are surely nothing would rule a curve that is there for
 /// the doubtful ones.
 const DOUBTFUL_FROM: f64 = 0.02;
+/// Odds of stage 1's threshold in those of the least likely screw of the tuning faces, and the range it is kept to.
+const COARSE_MARGIN: f32 = 0.2;
+const COARSE_RANGE: [f32; 2] = [0.05, 0.5];
 /// Cost of a screw that is not found, in units of one miss: its cover stays, and the face is looked at again or the unit fails.
 const MISS: f64 = 1.0;
 /// Cost of something taken for a screw: a burst of some seconds on what is none, and a mark on a part that is scrap.
@@ -72,11 +75,13 @@ pub fn tune(model: &Model, first_seed: u64, faces: u64, done: &dyn Fn(u64)) -> R
     };
     let detector = with(model, open);
     let (mut scores, mut unfound, mut screws) = (Vec::new(), 0, 0);
-    let (mut ratios, mut rims) = (Vec::new(), Vec::new());
+    let (mut centers, mut rims, mut peaks) = (Vec::new(), Vec::new(), Vec::new());
     for shot in kept.into_iter().chain(shots) {
         let found = detector.detect(&shot.frame, &Options::default()).screws;
         screws += shot.truth.screws.iter().filter(|s| s.detectable).count();
+        let map = coarse_map(&model.coarse, &shot.frame.color)?;
         for truth in shot.truth.screws.iter().filter(|s| s.detectable) {
+            peaks.push(peak(&map, truth.pixel, 0.4 * truth.head_d_px));
             let near = |s: &&Screw| s.pixel.distance_px(&truth.pixel) < 0.5 * truth.head_d_px;
             let finds = found.iter().filter(|s| s.verdict != Verdict::Other).filter(near);
             let Some(find) = finds.max_by(|a, b| a.score.total_cmp(&b.score)) else {
@@ -85,7 +90,7 @@ pub fn tune(model: &Model, first_seed: u64, faces: u64, done: &dyn Fn(u64)) -> R
             };
             scores.push((find.score, true));
             let error = errors(find.pixel, truth.pixel);
-            ratios.extend(error.map(|e| e / find.sigma_px));
+            centers.extend(error.map(|off_px| (off_px, find.sigma_px, find.score)));
             let (Some(depth), Some(camera)) = (&shot.frame.depth, &shot.frame.camera) else {
                 continue;
             };
@@ -103,18 +108,22 @@ pub fn tune(model: &Model, first_seed: u64, faces: u64, done: &dyn Fn(u64)) -> R
             }
         }
     }
-    corrections.fused_sigma *= one_sigma(ratios);
     rim_heights(&rims, &mut corrections);
     corrections.score = calibration(&scores);
     for (score, _) in &mut scores {
         *score = corrections.probability(*score);
     }
+    for (_, _, score) in &mut centers {
+        *score = corrections.probability(*score);
+    }
+    corrections.center_sigma = center_sigma(&centers);
     // with scores that are probabilities, least expected cost is a matter of the costs alone
     let (accept, review) = (1.0 - LOOK / FALSE_FIND, LOOK / MISS);
     Ok(Tuning {
         thresholds: Thresholds {
             accept: accept as f32,
             review: review as f32,
+            coarse: coarse_threshold(&peaks).unwrap_or(model.settings.thresholds.coarse),
             ..model.settings.thresholds
         },
         corrections,
@@ -123,6 +132,62 @@ pub fn tune(model: &Model, first_seed: u64, faces: u64, done: &dyn Fn(u64)) -> R
         without_candidate: unfound,
         cost_a_face: (cost(&scores, accept, review) + MISS * unfound as f64) / faces.max(1) as f64,
     })
+}
+
+/// The second highest probability of stage 1's cells near a place: from two cells on there is a candidate.
+fn peak(map: &ProbabilityMap, at: Pixel, reach_px: f64) -> f32 {
+    let stride = STRIDE as f64;
+    let cells = |c: f64, size: usize| {
+        let low = ((c - reach_px) / stride).ceil().max(0.0) as usize;
+        low..size.min((((c + reach_px) / stride).floor() + 1.0).max(0.0) as usize)
+    };
+    let mut highest = [0f32; 2];
+    for y in cells(at.v_px, map.height) {
+        for x in cells(at.u_px, map.width) {
+            let p = map.probability[y * map.width + x];
+            highest = [highest[0].max(p), highest[1].max(p.min(highest[0]))];
+        }
+    }
+    highest[1]
+}
+
+/// Stage 1's threshold: well below what it says of the least likely screw, and never so high that it decides by itself.
+fn coarse_threshold(peaks: &[f32]) -> Option<f32> {
+    let least = peaks
+        .iter()
+        .copied()
+        .reduce(f32::min)
+        .filter(|_| peaks.len() >= ENOUGH)?;
+    let odds = COARSE_MARGIN * least / (1.0 - least).max(1e-6);
+    Some((odds / (1.0 + odds)).clamp(COARSE_RANGE[0], COARSE_RANGE[1]))
+}
+
+/// [`Corrections::center_sigma`] under which errors along an axis (error, sigma of the fused cues, px; score) are likeliest, as ones
+/// with tails (Student's t, 4 degrees of freedom: a few gross ones do not rule), then scaled so that 68.3 % lie within it.
+fn center_sigma(errors: &[(f64, f64, f64)]) -> [f64; 3] {
+    let start = Corrections::default().center_sigma;
+    if errors.len() < ENOUGH {
+        return start;
+    }
+    let mut weights = Vector3::from(start);
+    let terms = |&(_, sigma_px, score): &(f64, f64, f64)| Vector3::from(Corrections::centre_terms(sigma_px, score));
+    for _ in 0..50 {
+        // Fisher scoring: the information of a t distribution's scale is 2 nu / (nu + 3)
+        let (mut slope, mut information) = (Vector3::zeros(), Matrix3::identity() * 1e-3);
+        for error in errors {
+            let terms = terms(error);
+            let square = (error.0 / weights.dot(&terms).exp()).powi(2);
+            slope += (1.0 - 5.0 * square / (4.0 + square)) * terms;
+            information += 8.0 / 7.0 * terms * terms.transpose();
+        }
+        let Some(inverse) = information.try_inverse() else {
+            break;
+        };
+        weights -= (inverse * slope).map(|step| step.clamp(-0.5, 0.5));
+    }
+    let ratio = |error: &(f64, f64, f64)| error.0 / weights.dot(&terms(error)).exp();
+    weights.x += one_sigma(errors.iter().map(ratio).collect()).ln();
+    weights.into()
 }
 
 /// A recess rim in the depth of a face.
@@ -353,6 +418,26 @@ mod tests {
         for off in [-0.1, 0.1] {
             assert!(cost(&calibrated, accept + off, review) > best);
             assert!(cost(&calibrated, accept, review + off) > best);
+        }
+    }
+
+    #[test]
+    fn sigma_of_centres_grows_with_doubt_as_their_errors_do() {
+        // errors of a normal distribution, deciles, whose sigma is 1.5 times what the cues say, and four times that for doubtful finds
+        let quantiles = [0.063, 0.189, 0.319, 0.454, 0.598, 0.755, 0.935, 1.15, 1.44, 1.96];
+        let mut errors = Vec::new();
+        for sigma in [0.2, 0.3, 0.5] {
+            for (doubt, score) in [(1.0, 0.999), (4.0, 0.6)] {
+                errors.extend(quantiles.map(|q| (q * 1.5 * doubt * sigma, sigma, score)));
+            }
+        }
+        let corrections = Corrections {
+            center_sigma: center_sigma(&errors),
+            ..Corrections::default()
+        };
+        for (sigma, doubt, score) in [(0.25, 1.0, 0.999), (0.4, 4.0, 0.6)] {
+            let (is, should) = (corrections.centre_px(sigma, score), 1.5 * doubt * sigma);
+            assert!((is / should).ln().abs() < 0.15, "{is} for {should}");
         }
     }
 

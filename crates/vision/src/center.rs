@@ -530,7 +530,7 @@ pub fn fuse(
         }
     }
     let mut center = mean(&held)?;
-    center.sigma_px = (center.sigma_px * corrections.fused_sigma).hypot(dispute);
+    center.sigma_px = center.sigma_px.hypot(dispute);
     Some(Fused {
         center,
         cues: held.iter().map(|(cue, _)| *cue).collect(),

@@ -480,17 +480,12 @@ impl Detector {
         let crossed = (drive == Drive::Cross || drive == Drive::Unknown)
             .then(|| cross(picture, find.pixel, find.diameter_px))
             .flatten();
-        let fused = fuse(
-            Some(learned),
-            circle,
-            crossed,
-            parallax_px,
-            &self.model.settings.corrections,
-        )?;
+        let corrections = &self.model.settings.corrections;
+        let fused = fuse(Some(learned), circle, crossed, parallax_px, corrections)?;
         let used = |cue| fused.cues.contains(&cue);
         Some(Screw {
             pixel: fused.center.pixel,
-            sigma_px: fused.center.sigma_px,
+            sigma_px: corrections.centre_px(fused.center.sigma_px, score),
             diameter_px: circle
                 .filter(|_| used(Cue::Circle))
                 .map_or(find.diameter_px, |c| c.diameter_px),

@@ -66,8 +66,9 @@ pub struct Corrections {
     pub cross_sigma: f64,
     /// True error over stated sigma of the learned centre.
     pub learned_sigma: f64,
-    /// True error over stated sigma of the fused centre.
-    pub fused_sigma: f64,
+    /// Sigma of a centre by that of the fused cues and by how doubtful the find is: its logarithm is `a + b ln sigma + c ln(1 - fits)`;
+    /// `[a, b, c]`. Worn and covered heads are off by more than their cues say.
+    pub center_sigma: [f64; 3],
     /// Height of the rim above the sheet from what stereo measures there: weights of the heights in rings around the recess, from the
     /// inside out, and of the head's diameter. Its window sees slot, flank and sheet with the rim.
     pub rim_height: [f64; RIM_TERMS],
@@ -90,6 +91,22 @@ impl Corrections {
         let log_odds = a * p.ln() - b * (1.0 - p).ln() + c;
         1.0 / (1.0 + (-log_odds).exp())
     }
+
+    /// Sigma of a centre, px, from that of the fused cues and the probability that the find is what it is taken for.
+    pub fn centre_px(&self, sigma_px: f64, score: f64) -> f64 {
+        let terms = Self::centre_terms(sigma_px, score);
+        terms
+            .iter()
+            .zip(self.center_sigma)
+            .map(|(term, weight)| term * weight)
+            .sum::<f64>()
+            .exp()
+    }
+
+    /// What a centre's sigma depends on, in the order of [`center_sigma`](Self::center_sigma).
+    pub fn centre_terms(sigma_px: f64, score: f64) -> [f64; 3] {
+        [1.0, sigma_px.max(1e-3).ln(), (1.0 - score).max(1e-3).ln()]
+    }
 }
 
 impl Default for Corrections {
@@ -100,7 +117,7 @@ impl Default for Corrections {
             below_rim: [0.0; 3],
             cross_sigma: 1.0,
             learned_sigma: 1.0,
-            fused_sigma: 1.0,
+            center_sigma: [0.0, 1.0, 0.0],
             rim_height: USUAL_RIM,
             rim_spread: 0.03,
             usual_height: [0.27, 0.09], // pan, truss, binding, washer and flange heads
