@@ -9,7 +9,7 @@
 use std::hint::black_box;
 use std::time::Instant;
 
-use nn::{LayerSpec, RowSource, Spec, Tensor, Trainer};
+use nn::{LayerSpec, RowSource, Spec, Step, Tensor, Trainer};
 
 /// A picture that costs nothing to read.
 struct Grey(usize, usize, usize);
@@ -127,6 +127,15 @@ fn engines(whole: &Spec) {
         fastest(8, || drop(black_box(clips.forward_batch(&batch)))),
     ];
     say("own kernels", own[0], own[1]);
+    let [whole8, clips8] = [(&whole, 3), (&clips, 4)].map(|(network, channels)| {
+        let input = vec![Step::between(-1.0, 1.0); channels];
+        network.clone().in_eight_bits(&input)
+    });
+    say(
+        "in 8 bits",
+        fastest(8, || drop(black_box(whole8.forward(&picture)))),
+        fastest(8, || drop(black_box(clips8.forward_batch(&batch)))),
+    );
     #[cfg(feature = "ort")]
     {
         let session = |network: &nn::Network| network.through_onnx_runtime(nn::onnx_runtime::Provider::Cpu);

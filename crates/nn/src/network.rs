@@ -187,14 +187,16 @@ impl Network {
     /// Where the batch does not have the network's input channels, or no pixels.
     pub fn forward_batch(&self, batch: &Tensor) -> Tensor {
         batch.assert_shape();
+        if batch.n > 0 {
+            self.check_input(batch.h, batch.w, batch.c);
+        }
+        if let Some(eight) = self.eight.as_ref().filter(|_| batch.n > 0) {
+            return eight.forward_batch(batch.n, batch.h, batch.w, |n| Picture { batch, n });
+        }
         let (h, w) = self.spec.output_size(batch.h, batch.w);
         let mut output = Tensor::zeros(batch.n, h, w, self.spec.output_channels());
         if batch.n == 0 {
             return output;
-        }
-        self.check_input(batch.h, batch.w, batch.c);
-        if let Some(eight) = &self.eight {
-            return eight.forward_batch(batch.n, batch.h, batch.w, |n| Picture { batch, n });
         }
         output
             .data
