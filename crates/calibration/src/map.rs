@@ -4,7 +4,7 @@ use crate::{
     Figures, FitError, FitReport, Level, Pair, Rejected, Volume,
     arm::Arm,
     correct,
-    gp::{self, Choice, Gp},
+    gp::{self, Choice, Gp, Stance},
     lattice::{Estimate, Grid, LEVELS, MAX_LEVERAGE, Model, Shape, believable, split},
     pair, realign,
     rigid::{self, Points, quantile},
@@ -239,6 +239,19 @@ struct Support {
     /// J1 to J3.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     joints_rad: Option<[f64; 3]>,
+    /// The sign of each one's last motion.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    came_from: Option<[f64; 3]>,
+}
+
+impl Support {
+    /// How the arm stood.
+    fn stance(&self) -> Option<Stance> {
+        Some(Stance {
+            joints_rad: self.joints_rad?,
+            came_from: self.came_from.unwrap_or_default(),
+        })
+    }
 }
 
 impl std::fmt::Debug for Map {
@@ -266,8 +279,9 @@ impl Map {
         } else {
             believable(&points, &motion, &grid)
         };
+        let stances = stances(pairs);
         let fitted = match method {
-            Method::Gp => Some(gaussian(pairs, &points, &mut keep)?),
+            Method::Gp => Some(gaussian(&stances, &points, &mut keep)?),
             _ => None,
         };
         let used: Vec<usize> = (0..keep.len()).filter(|&i| keep[i]).collect();
@@ -350,12 +364,16 @@ impl Map {
         if let Some(ripple) = fitted.as_ref().and_then(|f| f.choice.ripple.as_ref()) {
             report.notes.push(format!("ripple of the gears is taken out: {ripple}"));
         }
-        let ripple = fitted.as_ref().is_some_and(|f| f.choice.ripple.is_some());
-        let support = |(&i, (c, t)): (&usize, (&Vector3<f64>, &Vector3<f64>))| Support {
-            id: pairs[points.index[i]].id,
-            camera: Point::from_vector(*c),
-            command: Point::from_vector(*t),
-            joints_rad: first_joints(&pairs[points.index[i]]).filter(|_| ripple),
+        let armed = fitted.as_ref().is_some_and(|f| f.choice.flawed.is_some());
+        let support = |(&i, (c, t)): (&usize, (&Vector3<f64>, &Vector3<f64>))| {
+            let stance = stances[points.index[i]].filter(|_| armed);
+            Support {
+                id: pairs[points.index[i]].id,
+                camera: Point::from_vector(*c),
+                command: Point::from_vector(*t),
+                joints_rad: stance.map(|s| s.joints_rad),
+                came_from: stance.map(|s| s.came_from),
+            }
         };
         let (low, high) = command
             .iter()
@@ -505,8 +523,8 @@ impl Map {
                 let points = points.ok_or_else(|| bad("it rests on points that it does not hold".into()))?;
                 let camera: Vec<_> = points.iter().map(|p| p.camera.vector()).collect();
                 let command: Vec<_> = points.iter().map(|p| p.command.vector()).collect();
-                let joints: Option<Vec<_>> = points.iter().map(|p| p.joints_rad).collect();
-                let again = Gp::again(&camera, &command, joints.as_deref(), choice);
+                let stances: Option<Vec<_>> = points.iter().map(|p| p.stance()).collect();
+                let again = Gp::again(&camera, &command, stances, choice);
                 Some(again.ok_or_else(|| bad("its points do not determine it".into()))?)
             }
             None => None,
@@ -605,9 +623,10 @@ impl Map {
             .unwrap_or_default()
     }
 
-    /// The arm's lengths and tool, where ripple was found.
+    /// The arm's lengths and tool, where the pairs had joint angles.
     pub(crate) fn arm(&self) -> Option<&Arm> {
-        Some(&self.file.gp.as_ref()?.ripple.as_ref()?.arm)
+        let choice = self.file.gp.as_ref()?;
+        choice.flawed.as_ref().or(choice.ripple.as_ref().map(|r| &r.arm))
     }
 
     /// The arm and the camera that the map is true for.
@@ -665,30 +684,55 @@ fn hull(e: &Estimate, leverage: f64, reach: f64) -> Hull {
     }
 }
 
-fn first_joints(pair: &Pair) -> Option<[f64; 3]> {
-    pair.joints_rad.map(|[j1, j2, j3, ..]| [j1, j2, j3])
+/// How the arm stood at every visit; where each joint came from is known from the visit before, whether the marker was seen there or not.
+fn stances(pairs: &[Pair]) -> Vec<Option<Stance>> {
+    /// A joint that turned less kept its side, rad.
+    const STILL_RAD: f64 = 1e-4;
+    let mut order: Vec<usize> = (0..pairs.len()).collect();
+    order.sort_by(|&a, &b| pairs[a].t_s.total_cmp(&pairs[b].t_s));
+    let mut stances = vec![None; pairs.len()];
+    let mut before: Option<Stance> = None;
+    for i in order {
+        let now = pairs[i].joints_rad.map(|[j1, j2, j3, ..]| {
+            let joints_rad = [j1, j2, j3];
+            let came_from = before.map_or([0.0; 3], |before| {
+                std::array::from_fn(|j| match joints_rad[j] - before.joints_rad[j] {
+                    turned if turned.abs() > STILL_RAD => turned.signum(),
+                    _ => before.came_from[j],
+                })
+            });
+            Stance { joints_rad, came_from }
+        });
+        before = now.or(before);
+        stances[i] = now;
+    }
+    stances
 }
 
-/// The Gaussian process of the points that are believed, or of as many of them as it needs; what it does not believe is struck from
-/// `keep`.
-fn gaussian(pairs: &[Pair], points: &Points, keep: &mut [bool]) -> Result<gp::Fitted, FitError> {
-    let mut used: Vec<usize> = (0..keep.len()).filter(|&i| keep[i]).collect();
+/// The Gaussian process of the points that are believed, or of as many of them as it needs; `keep` says which are, before and after.
+fn gaussian(stances: &[Option<Stance>], points: &Points, keep: &mut [bool]) -> Result<gp::Fitted, FitError> {
+    let believed = keep.iter().filter(|&&k| k).count();
     let method = Method::Gp;
     let too_few = FitError::TooFew {
-        have: used.len(),
+        have: believed,
         need: method.fewest_pairs(),
         method: method.name(),
     };
-    if used.len() < method.fewest_pairs() {
+    if believed < method.fewest_pairs() {
         return Err(too_few);
     }
-    used = spread(used.len(), gp::MOST_POINTS)
-        .into_iter()
-        .map(|k| used[k])
-        .collect();
+    // doubted points have another chance, unless there are more than enough of the others
+    let asked: Vec<usize> = (0..keep.len()).filter(|&i| keep[i] || keep.len() <= gp::MOST_POINTS).collect();
+    let used: Vec<usize> = spread(asked.len(), gp::MOST_POINTS).into_iter().map(|k| asked[k]).collect();
     let of = |all: &[Vector3<f64>]| -> Vec<Vector3<f64>> { used.iter().map(|&i| all[i]).collect() };
-    let joints: Option<Vec<_>> = used.iter().map(|&i| first_joints(&pairs[points.index[i]])).collect();
-    let mut fitted = gp::fit(&of(&points.camera), &of(&points.command), joints.as_deref()).ok_or(too_few)?;
+    let stances: Option<Vec<_>> = used.iter().map(|&i| stances[points.index[i]]).collect();
+    let command = of(&points.command);
+    let arm = stances.as_ref().and_then(|stances| {
+        let joints: Vec<_> = stances.iter().map(|s| s.joints_rad).collect();
+        Arm::of(&command, &joints)
+    });
+    let at_first = used.iter().map(|&i| keep[i]).collect();
+    let mut fitted = gp::fit(&of(&points.camera), &command, stances.as_deref(), arm, at_first).ok_or(too_few)?;
     for (&i, &kept) in used.iter().zip(&fitted.keep) {
         keep[i] = kept;
     }

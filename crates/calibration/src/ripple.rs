@@ -8,14 +8,10 @@ use crate::arm::Arm;
 use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 
-/// Standard deviation of a wave's cosine and sine before anything is measured, rad.
-pub(crate) const PRIOR_RAD: f64 = 3e-4;
+/// Standard deviation of a wave's cosine and sine before anything is measured, rad: a tenth of a millimetre at the tool.
+pub(crate) const PRIOR_RAD: f64 = 1e-4;
 /// Waves that may be kept.
-pub(crate) const MOST_WAVES: usize = 8;
-/// Twice the log likelihood that a wave has to gain.
-pub(crate) const LEAST_GAIN: f64 = 5.0;
-/// Share of the square of the left-out errors that may be left with it.
-pub(crate) const LESS: f64 = 0.99;
+pub(crate) const MOST_WAVES: usize = 10;
 /// Waves of one joint are at least so many cycles a turn apart.
 pub(crate) const APART: f64 = 2.0;
 

@@ -49,7 +49,7 @@ impl Severity {
         link_mm: 0.25,
         zero_rad: 2e-4,
         ripple_mm: 0.05,
-        hysteresis_mm: 0.008,
+        hysteresis_mm: 0.012,
         repeat_mm: 0.007,
         warm_mm: 0.03,
         lens_px: 0.4,
@@ -62,7 +62,7 @@ impl Severity {
         link_mm: 0.5,
         zero_rad: 4e-4,
         ripple_mm: 0.1,
-        hysteresis_mm: 0.016,
+        hysteresis_mm: 0.024,
         repeat_mm: 0.014,
         warm_mm: 0.06,
         lens_px: 0.8,
@@ -189,12 +189,12 @@ impl World {
         Volume::between(Point::new(950.0, -450.0, 150.0), Point::new(1350.0, 450.0, 900.0))
     }
 
-    /// Where the marker really is, base frame, for encoder angles that were reached in a direction.
-    fn tool(&self, q: [f64; 6], came_from: f64, warmth: f64) -> Vector3<f64> {
-        let hysteresis = came_from * self.severity.hysteresis_mm / 1200.0;
+    /// Where the marker really is, base frame, for encoder angles; `came_from` is the sign of each joint's last motion.
+    fn tool(&self, q: [f64; 6], came_from: [f64; 6], warmth: f64) -> Vector3<f64> {
+        let lost_rad = self.severity.hysteresis_mm / 1200.0;
         let mut turned = q;
         for (j, t) in turned.iter_mut().enumerate() {
-            *t += self.zeros_rad[j] + hysteresis;
+            *t += self.zeros_rad[j] + came_from[j] * lost_rad;
         }
         for (j, waves) in self.waves.iter().enumerate() {
             turned[j] += waves
@@ -234,7 +234,7 @@ impl World {
 
     /// What the cameras say, without noise, of the marker that was told to go to a place when everything is warm.
     pub fn sight(&self, command: Vector3<f64>) -> Point<Camera> {
-        Point::from_vector(self.look_with(self.tool(joints(command), 0.0, 1.0)))
+        Point::from_vector(self.look_with(self.tool(joints(command), [0.0; 6], 1.0)))
     }
 
     fn look_with(&self, base: Vector3<f64>) -> Vector3<f64> {
@@ -242,11 +242,11 @@ impl World {
         self.seen(camera.coords)
     }
 
-    /// A visit at a time, s: a row of a capture with so many frames.
-    fn visit(&self, target: &Target, t_s: f64, frames: usize, rng: &mut Pcg64Mcg) -> Pair {
+    /// A visit at a time, s, from where the arm was: a row of a capture with so many frames.
+    fn visit(&self, target: &Target, from: [f64; 6], t_s: f64, frames: usize, rng: &mut Pcg64Mcg) -> Pair {
         let q = joints(target.command.vector());
+        let came_from = std::array::from_fn(|j| (q[j] - from[j]).signum());
         let warmth = 1.0 - (-(BEFORE_S + t_s) / WARM_UP_S).exp();
-        let came_from = if rng.random_range(0.0..1.0) < 0.5 { 1.0 } else { -1.0 };
         let tool = self.tool(q, came_from, warmth) + gauss3(rng) * self.severity.repeat_mm;
         let seen = self.look_with(tool);
         let [du, dv, dz] = gauss3(rng).map(|g| g / (frames as f64).sqrt()).into();
@@ -263,9 +263,11 @@ impl World {
     pub fn capture(&self, seed: u64, points: usize, frames: usize) -> Vec<Pair> {
         let plan = scattered(&Self::volume(), points).unwrap_or_default();
         let rng = &mut Pcg64Mcg::seed_from_u64(seed);
+        let mut from = joints(Self::volume().min.vector());
         plan.iter()
             .map(|target| {
-                let mut pair = self.visit(target, VISIT_S * target.id as f64, frames, rng);
+                let mut pair = self.visit(target, from, VISIT_S * target.id as f64, frames, rng);
+                from = pair.joints_rad.unwrap_or(from);
                 if rng.random_range(0.0..1.0) < 0.04 {
                     miss(&mut pair);
                 }
@@ -278,11 +280,13 @@ impl World {
     pub fn lattice(&self, seed: u64) -> (Vec<Pair>, Vec<u64>) {
         let rng = &mut Pcg64Mcg::seed_from_u64(seed);
         let mut outliers = Vec::new();
+        let mut from = joints(Self::volume().min.vector());
         let pairs = lattice(&Self::volume(), 50.0)
             .unwrap_or_default()
             .iter()
             .map(|target| {
-                let mut pair = self.visit(target, VISIT_S * target.id as f64, 1, rng);
+                let mut pair = self.visit(target, from, VISIT_S * target.id as f64, 1, rng);
+                from = pair.joints_rad.unwrap_or(from);
                 let hidden = target.node.is_some_and(|[i, j, k]| i < 3 && j < 4 && k < 3);
                 if hidden || rng.random_range(0.0..1.0) < 0.03 {
                     miss(&mut pair);
@@ -299,13 +303,16 @@ impl World {
     /// Pairs anywhere in the volume, long after the start: everything is warm.
     pub fn fresh(&self, seed: u64, points: usize, frames: usize) -> Vec<Pair> {
         let rng = &mut Pcg64Mcg::seed_from_u64(seed);
+        let mut from = joints(Self::volume().min.vector());
         let visit = |id| {
             let target = Target {
                 id,
                 node: None,
                 command: Point::from_vector(anywhere(rng)),
             };
-            self.visit(&target, 7200.0, frames, rng)
+            let pair = self.visit(&target, from, 7200.0, frames, rng);
+            from = pair.joints_rad.unwrap_or(from);
+            pair
         };
         (0..points as u64).map(visit).collect()
     }
