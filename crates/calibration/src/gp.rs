@@ -8,6 +8,7 @@ use crate::arm::Arm;
 use crate::ripple::{self, Ripple, Wave};
 use nalgebra::{Cholesky, DMatrix, DVector, Dyn, Isometry3, Point3, Vector3};
 use serde::{Deserialize, Serialize};
+use std::rc::Rc;
 
 /// Length in which places are measured, mm.
 const UNIT_MM: f64 = 500.0;
@@ -346,7 +347,7 @@ impl Part {
 /// The covariance of all residuals, inverted: one block across (twice), one along, and as a correction of low rank what the arm's flaws
 /// and the waves do, in units of what is expected of each.
 struct System {
-    blocks: [DMatrix<f64>; 2],
+    blocks: Rc<[DMatrix<f64>; 2]>,
     /// Effects of flaws and waves, and the blocks' inverse times them.
     columns: DMatrix<f64>,
     solved: DMatrix<f64>,
@@ -357,7 +358,15 @@ struct System {
 impl System {
     fn new(points: &Points, kernels: [Kernel; 2], columns: DMatrix<f64>) -> Option<Self> {
         let [across, along] = kernels.map(|k| k.factor(&points.places).map(|f| f.inverse()));
-        let blocks = [across?, along?];
+        Self::over(Rc::new([across?, along?]), columns)
+    }
+
+    /// The same kernels with other columns.
+    fn with(&self, columns: DMatrix<f64>) -> Option<Self> {
+        Self::over(Rc::clone(&self.blocks), columns)
+    }
+
+    fn over(blocks: Rc<[DMatrix<f64>; 2]>, columns: DMatrix<f64>) -> Option<Self> {
         let mut system = Self {
             blocks,
             solved: DMatrix::zeros(columns.nrows(), 0),
@@ -433,16 +442,23 @@ impl System {
         })
     }
 
-    /// Twice the log of how much likelier the residuals are with one more wave.
-    fn gain(&self, weights: &DVector<f64>, wave: &DMatrix<f64>) -> f64 {
-        let crossed = self.solved.transpose() * wave;
-        let inner = wave.transpose() * self.block_times(wave) - crossed.transpose() * &self.small * &crossed;
-        let seen = wave.transpose() * weights;
-        let with = &inner + DMatrix::identity(2, 2);
-        let Some(factor) = with.clone().cholesky() else {
-            return 0.0;
+    /// Twice the log of how much likelier the residuals are with one more wave, for each of several, two columns each.
+    fn gains(&self, weights: &DVector<f64>, waves: &DMatrix<f64>) -> Vec<f64> {
+        let solved = self.block_times(waves);
+        let crossed = self.solved.tr_mul(waves);
+        let less = &self.small * &crossed;
+        let seen = waves.tr_mul(weights);
+        let gain = |k: usize| {
+            let two = |m: &DMatrix<f64>| m.columns(2 * k, 2).into_owned();
+            let inner = two(waves).tr_mul(&two(&solved)) - two(&crossed).tr_mul(&two(&less));
+            let with = inner + DMatrix::identity(2, 2);
+            let seen = seen.rows(2 * k, 2);
+            let Some(factor) = with.clone().cholesky() else {
+                return 0.0;
+            };
+            seen.dot(&factor.solve(&seen)) - with.determinant().ln()
         };
-        seen.dot(&factor.solve(&seen)) - with.determinant().ln()
+        (0..waves.ncols() / 2).map(gain).collect()
     }
 }
 
@@ -621,35 +637,39 @@ fn waves(points: &Points, arm: Option<&Arm>, start: [Kernel; 2]) -> Option<(Opti
     let mut least = square(&system);
     while ripple.waves.len() < ripple::MOST_WAVES {
         let weights = system.times(&residuals);
-        let gain = |wave: Wave| system.gain(&weights, &points.wave(&turns, wave));
+        let gains = |waves: &[Wave]| system.gains(&weights, &side_by_side(points, &turns, waves));
         let free = |wave: &Wave| {
             let near = |w: &Wave| w.joint == wave.joint && (w.cycles - wave.cycles).abs() < ripple::APART;
             !ripple.waves.iter().any(near)
         };
-        let found = ripple::candidates().filter(free).map(|w| (gain(w), w));
-        let (gained, wave) = ripple::refined(found.max_by(|a, b| a.0.total_cmp(&b.0))?, &gain);
+        let candidates: Vec<Wave> = ripple::candidates().filter(free).collect();
+        // some at a time: all of them would not fit into the processor's memory
+        let gained = candidates.chunks(32).flat_map(gains).zip(candidates.iter().copied());
+        let (gained, wave) = ripple::refined(gained.max_by(|a, b| a.0.total_cmp(&b.0))?, &gains);
         if gained <= 0.0 {
             break;
         }
         let mut more = ripple.clone();
         more.waves.push(wave);
-        let kernels = kernels(points, &with(&more.waves), both, 40)?;
+        let kernels = kernels(points, &with(&more.waves), both, 15)?;
+        let mut now = System::new(points, kernels, with(&more.waves))?;
         // with the new one the others are clearer than they were
         for k in 0..more.waves.len() - 1 {
             let mut others = more.waves.clone();
             let own = others.remove(k);
-            let without = System::new(points, kernels, with(&others))?;
+            let without = now.with(with(&others))?;
             let weights = without.times(&residuals);
-            let gain = |wave: Wave| without.gain(&weights, &points.wave(&turns, wave));
-            more.waves[k] = ripple::refined((gain(own), own), &gain).1;
+            let gains = |waves: &[Wave]| without.gains(&weights, &side_by_side(points, &turns, waves));
+            more.waves[k] = ripple::refined((gains(&[own])[0], own), &gains).1;
         }
-        let now = System::new(points, kernels, with(&more.waves))?;
+        now = now.with(with(&more.waves))?;
         let left = square(&now);
         if left > least {
             break;
         }
         (ripple, both, least, system) = (more, kernels, left, now);
     }
+    both = kernels(points, &with(&ripple.waves), both, 40)?;
     Some((Some(ripple).filter(|r| !r.waves.is_empty()), both))
 }
 
@@ -661,8 +681,8 @@ pub(crate) struct Gp {
     counts: [usize; 3],
     /// Correction along the directions of the ray at each node, mm.
     correction: Vec<Vector3<f64>>,
-    /// Variance of the map across and along at every second node, mm².
-    variance: Vec<[f64; 2]>,
+    /// Variance at every second node, mm²: of what is smooth, across and along, and of ripple and lost motion, across and along.
+    variance: Vec<[f64; 4]>,
     ripple: Option<Ripple>,
     /// Cosine and sine of each wave, rad.
     swings: Vec<[f64; 2]>,
@@ -701,8 +721,12 @@ impl Gp {
         let coefficients = system.columns.tr_mul(&weights);
         let swings = coefficients.rows_range(flawed..) * ripple::PRIOR_RAD;
         let lost = coefficients.rows_range(known..flawed).into_owned();
-        // what flaws do to a place in the camera's frame, along its ray: a row a component; and the variance of lost motion, since
-        // nobody knows from where the joints will come
+        // variance of each wave's swing, whatever its phase, rad²
+        let waves = choice.ripple.as_ref().map_or(&[][..], |r| &r.waves);
+        let open = |k: usize| 0.5 * (system.small[(k, k)] + system.small[(k + 1, k + 1)]) * ripple::PRIOR_RAD.powi(2);
+        let open: Vec<(usize, f64)> = waves.iter().enumerate().map(|(w, wave)| (wave.joint, open(flawed + 2 * w))).collect();
+        // what flaws do to a place in the camera's frame, along its ray: a row a component; and the variance of what is too short for
+        // the nodes: of waves, and of lost motion, since nobody knows from where the joints will come
         let flaws_at = |camera: Vector3<f64>| -> (DMatrix<f64>, [f64; 3]) {
             let Some(arm) = &choice.flawed else {
                 return (DMatrix::zeros(3, 0), [0.0; 3]);
@@ -710,9 +734,13 @@ impl Gp {
             let frame = ray_frame(&points.motion, &camera);
             let base = (points.motion * Point3::from(camera)).coords;
             let moved = arm.flaws(base);
-            let loses = lost_motion(arm, base, [1.0; 3]);
-            let variance = [0, 1, 2].map(|a| loses.iter().zip(&lost).map(|(l, c)| (l.dot(&frame[a]) * c).powi(2)).sum());
-            (DMatrix::from_fn(3, known, |a, k| moved[k].dot(&frame[a])), variance)
+            let levers = arm.pose(base).levers;
+            let short = [0, 1, 2].map(|a| {
+                let lever = |j: usize| levers[j].dot(&frame[a]).powi(2);
+                let lost = (0..3).map(|j| lever(j) * (LOST_RAD * lost[j]).powi(2)).sum::<f64>();
+                lost + open.iter().map(|(j, variance)| lever(*j) * variance).sum::<f64>()
+            });
+            (DMatrix::from_fn(3, known, |a, k| moved[k].dot(&frame[a])), short)
         };
         let certain = system.small.view((0, 0), (known, known)).into_owned();
         let reach = [0, 1, 2].map(|a| system.solved.view((a * n, 0), (n, known)).into_owned());
@@ -734,7 +762,7 @@ impl Gp {
                 for x in 0..counts[0] {
                     let at = place(x, y, z);
                     let k = kernel.map(|k| DVector::from_fn(n, |i, _| k.of(&at, &points.places[i])));
-                    let (flaws, lost) = flaws_at(points.centre + at * UNIT_MM);
+                    let (flaws, short) = flaws_at(points.centre + at * UNIT_MM);
                     let part = |a: usize, k: &DVector<f64>| {
                         k.dot(&weights.rows(a * n, n)) + flaws.row(a).tr_dot(&coefficients.rows(0, known))
                     };
@@ -746,8 +774,8 @@ impl Gp {
                             let left = flaws.row(a).transpose() - reach[a].tr_mul(k);
                             left.dot(&(&certain * &left))
                         };
-                        let across = 0.5 * (open(0, &k[0]) + open(1, &k[0]) + lost[0] + lost[1]);
-                        variance.push([of(0) + across, of(1) + open(2, &k[1]) + lost[2]]);
+                        let across = 0.5 * (open(0, &k[0]) + open(1, &k[0]));
+                        variance.push([of(0) + across, of(1) + open(2, &k[1]), 0.5 * (short[0] + short[1]), short[2]]);
                     }
                 }
             }
@@ -786,7 +814,7 @@ impl Gp {
                 .map(|c| variance[c] / self.noise_mm[c].max(SURE_MM).powi(2))
                 .into_iter()
                 .fold(0.0, f64::max),
-            sigma_mm: [0, 1].map(|c| self.scale[c] * (variance[c] + self.noise_mm[c].powi(2)).sqrt()),
+            sigma_mm: [0, 1].map(|c| self.scale[c] * (variance[c] + variance[c + 2] + self.noise_mm[c].powi(2)).sqrt()),
         }
     }
 
@@ -820,10 +848,10 @@ impl Gp {
         sum
     }
 
-    fn linear(&self, place: [f64; 3]) -> [f64; 2] {
+    fn linear(&self, place: [f64; 3]) -> [f64; 4] {
         let counts = self.counts.map(|n| n.div_ceil(2));
         let at = place.map(|p| p / 2.0);
-        let mut sum = [0.0; 2];
+        let mut sum = [0.0; 4];
         for corner in 0..8 {
             let (mut index, mut weight) = (0, 1.0);
             for a in (0..3).rev() {
@@ -833,7 +861,7 @@ impl Gp {
                 weight *= if step == 1 { t } else { 1.0 - t };
             }
             let value = self.variance[index];
-            sum = [0, 1].map(|c| sum[c] + weight * value[c]);
+            sum = [0, 1, 2, 3].map(|c| sum[c] + weight * value[c]);
         }
         sum
     }

@@ -73,15 +73,14 @@ pub(crate) fn candidates() -> impl Iterator<Item = Wave> {
 }
 
 /// The best wave near one, with what it gains.
-pub(crate) fn refined(from: (f64, Wave), gain: &impl Fn(Wave) -> f64) -> (f64, Wave) {
+pub(crate) fn refined(from: (f64, Wave), gains: &impl Fn(&[Wave]) -> Vec<f64>) -> (f64, Wave) {
     let mut best = from;
     for step in [0.25, 0.125, 0.06] {
-        for cycles in [best.1.cycles - step, best.1.cycles + step] {
-            let wave = Wave {
-                joint: best.1.joint,
-                cycles,
-            };
-            let gained = gain(wave);
+        let beside = [-step, step].map(|by| Wave {
+            cycles: best.1.cycles + by,
+            ..best.1
+        });
+        for (gained, wave) in gains(&beside).into_iter().zip(beside) {
             if gained > best.0 {
                 best = (gained, wave);
             }
