@@ -16,6 +16,8 @@ const UNIT_MM: f64 = 500.0;
 const AFFINE_MM: f64 = 10.0;
 /// Points by which a kernel is chosen; more say little more and take their number to the third power of time.
 const KERNEL_POINTS: usize = 180;
+/// With more points than this, half of them tell how true sigma is.
+const MANY_POINTS: usize = 150;
 /// Points that the process rests on.
 pub(crate) const MOST_POINTS: usize = 400;
 /// Left-out errors of more sigmas than this are outliers.
@@ -42,7 +44,7 @@ const LOST_RAD: f64 = 2e-5;
 /// A map that is as sure as this is sure enough, however well the camera measures: a seventh of what the paper reaches, mm.
 const SURE_MM: f64 = 0.05;
 /// Distance of the nodes of the baked correction, mm; of its variance, twice that.
-const NODE_MM: f64 = 40.0;
+const NODE_MM: f64 = 32.0;
 /// How far beyond the points the correction is baked, mm.
 const MARGIN_MM: f64 = 80.0;
 
@@ -437,7 +439,8 @@ impl System {
             let own = columns.row(a).transpose();
             let said = k.dot(&weights.rows(a * n, n)) + own.dot(&coefficients);
             let open = own - self.solved.rows(a * n, n).tr_mul(&k);
-            let variance = kernel.of(at, at) - k.dot(&(block * &k)) + kernel.noise_mm.powi(2) + open.dot(&(&self.small * &open));
+            let variance =
+                kernel.of(at, at) - k.dot(&(block * &k)) + kernel.noise_mm.powi(2) + open.dot(&(&self.small * &open));
             (alone.residuals[a][0] - said).powi(2) / variance.max(1e-12)
         })
     }
@@ -570,20 +573,15 @@ pub(crate) fn fit(
         }
     }
     let system = System::new(&points, both, columns(&points, arm.as_ref(), ripple.as_ref()))?;
-    let (errors, variances) = system.left_out(&stacked(&points.residuals));
+    let (errors, _) = system.left_out(&stacked(&points.residuals));
     let n = used.len();
-    let quantile = |parts: &[usize]| {
-        let z = parts.iter().flat_map(|&a| (0..n).map(move |i| a * n + i));
-        let z: Vec<f64> = z.map(|k| (errors[k].powi(2) / variances[k]).sqrt()).collect();
-        crate::rigid::quantile(z, 0.6827).clamp(0.5, 3.0)
-    };
     let choice = Choice {
         points: Vec::new(), // the caller knows which of his these are
         across: both[0],
         along: both[1],
-        flawed: arm,
         ripple,
-        scale: [quantile(&[0, 1]), quantile(&[2])],
+        scale: scales(&points, arm.as_ref(), both)?,
+        flawed: arm,
     };
     let left_out = (0..n)
         .map(|i| (0..3).map(|a| points.frames[i][a] * -errors[a * n + i]).sum())
@@ -595,6 +593,29 @@ pub(crate) fn fit(
         left_out,
         gp,
     })
+}
+
+/// True error over stated sigma, across and along the ray, at points that had no say in kernels and waves.
+fn scales(points: &Points, arm: Option<&Arm>, start: [Kernel; 2]) -> Option<[f64; 2]> {
+    let n = points.places.len();
+    let folds = if n > MANY_POINTS { 2 } else { 4 };
+    let mut squares = [Vec::new(), Vec::new()];
+    for fold in 0..folds {
+        let (held, used): (Vec<usize>, Vec<usize>) = (0..n).partition(|i| i % folds == fold);
+        let used = points.only(&used);
+        let (ripple, both) = waves(&used, arm, start)?;
+        let system = System::new(&used, both, columns(&used, arm, ripple.as_ref()))?;
+        let weights = system.times(&stacked(&used.residuals));
+        for i in held {
+            let alone = points.only(&[i]);
+            let own = columns(&alone, arm, ripple.as_ref());
+            let [a, b, along] = system.surprise(&used, both, &weights, &alone, &own);
+            squares[0].extend([a, b]);
+            squares[1].push(along);
+        }
+    }
+    // the 90 % of all that matter for an interval, without the few that make it too wide
+    Some(squares.map(|s| (crate::rigid::quantile(s, 0.9).sqrt() / 1.6449).clamp(0.5, 3.0)))
 }
 
 /// How many sigmas an error is, of its squares in sigmas: across the ray, twice, and along it.
@@ -673,6 +694,139 @@ fn waves(points: &Points, arm: Option<&Arm>, start: [Kernel; 2]) -> Option<(Opti
     Some((Some(ripple).filter(|r| !r.waves.is_empty()), both))
 }
 
+/// The process without baking: slow, and true everywhere.
+struct Exact<'a> {
+    points: &'a Points,
+    choice: &'a Choice,
+    kernels: [Kernel; 2],
+    system: System,
+    weights: DVector<f64>,
+    /// Of every column, in units of what is expected of it: flaws that a place tells, lost motion, waves.
+    coefficients: DVector<f64>,
+    placed: usize,
+    flawed: usize,
+    /// Covariance of the placed flaws, and the columns of each component that reach them.
+    open: DMatrix<f64>,
+    reach: [DMatrix<f64>; 3],
+}
+
+/// A place as [`Exact`] sees it.
+struct At {
+    place: Vector3<f64>,
+    base: Vector3<f64>,
+    frame: [Vector3<f64>; 3],
+    /// Covariance with every point, across and along.
+    near: [DVector<f64>; 2],
+    /// What the placed flaws do there: a row a component.
+    flaws: DMatrix<f64>,
+}
+
+impl<'a> Exact<'a> {
+    fn new(points: &'a Points, choice: &'a Choice) -> Option<Self> {
+        let n = points.places.len();
+        let flaws = points.flaws(choice.flawed.as_ref());
+        let (placed, flawed) = (flaws.placed, flaws.columns.ncols());
+        let kernels = [choice.across, choice.along];
+        let columns = columns(points, choice.flawed.as_ref(), choice.ripple.as_ref());
+        let system = System::new(points, kernels, columns)?;
+        let weights = system.times(&stacked(&points.residuals));
+        Some(Self {
+            points,
+            choice,
+            kernels,
+            coefficients: system.columns.tr_mul(&weights),
+            weights,
+            placed,
+            flawed,
+            open: system.small.view((0, 0), (placed, placed)).into_owned(),
+            reach: [0, 1, 2].map(|a| system.solved.view((a * n, 0), (n, placed)).into_owned()),
+            system,
+        })
+    }
+
+    /// Cosine and sine of each wave, rad.
+    fn swings(&self) -> Vec<[f64; 2]> {
+        let waves = self.coefficients.rows_range(self.flawed..) * ripple::PRIOR_RAD;
+        (0..waves.len() / 2).map(|k| [waves[2 * k], waves[2 * k + 1]]).collect()
+    }
+
+    /// A place in the camera's frame, from the centre of the points, in [`UNIT_MM`].
+    fn at(&self, place: Vector3<f64>) -> At {
+        let points = self.points;
+        let camera = points.centre + place * UNIT_MM;
+        let base = (points.motion * Point3::from(camera)).coords;
+        let frame = ray_frame(&points.motion, &camera);
+        let moved = self.choice.flawed.as_ref().map_or_else(Vec::new, |arm| arm.flaws(base));
+        At {
+            near: self
+                .kernels
+                .map(|k| DVector::from_fn(points.places.len(), |i, _| k.of(&place, &points.places[i]))),
+            flaws: DMatrix::from_fn(3, self.placed, |a, k| moved[k].dot(&frame[a])),
+            place,
+            base,
+            frame,
+        }
+    }
+
+    /// The smooth part of the correction, along the directions of the ray, mm.
+    fn correction(&self, at: &At) -> Vector3<f64> {
+        let n = self.points.places.len();
+        Vector3::from_fn(|a, _| {
+            at.near[a / 2].dot(&self.weights.rows(a * n, n))
+                + at.flaws.row(a).tr_dot(&self.coefficients.rows(0, self.placed))
+        })
+    }
+
+    /// Variance at each place, mm²: of the smooth part, across and along the ray, and of what is too short for the nodes: of waves, and of
+    /// lost motion, since nobody knows from where the joints will come.
+    fn variances(&self, places: Vec<At>) -> Vec<[f64; 4]> {
+        // many places at once: a product of matrices is far faster than one column at a time
+        let solved = [0, 1].map(|c| {
+            let near: Vec<_> = places.iter().map(|at| at.near[c].clone()).collect();
+            &self.system.blocks[c] * DMatrix::from_columns(&near)
+        });
+        let of = |(k, at): (usize, &At)| {
+            let smooth = |c: usize| {
+                let own = self.kernels[c].of(&at.place, &at.place);
+                (own - at.near[c].dot(&solved[c].column(k))).max(0.0)
+            };
+            // what is not known of the flaws, as far as it is not what the kernels take it for
+            let flaws = |a: usize| {
+                let left = at.flaws.row(a).transpose() - self.reach[a].tr_mul(&at.near[a / 2]);
+                left.dot(&(&self.open * &left))
+            };
+            let short = self.short(at);
+            [
+                smooth(0) + 0.5 * (flaws(0) + flaws(1)),
+                smooth(1) + flaws(2),
+                0.5 * (short[0] + short[1]),
+                short[2],
+            ]
+        };
+        places.iter().enumerate().map(of).collect()
+    }
+
+    /// Variance of lost motion and waves along the directions of the ray, mm².
+    fn short(&self, at: &At) -> [f64; 3] {
+        let Some(arm) = &self.choice.flawed else {
+            return [0.0; 3];
+        };
+        let levers = arm.pose(at.base).levers;
+        let waves = self.choice.ripple.as_ref().map_or(&[][..], |r| &r.waves);
+        [0, 1, 2].map(|a| {
+            let lever = |j: usize| levers[j].dot(&at.frame[a]).powi(2);
+            let lost = |j: usize| (LOST_RAD * self.coefficients[self.placed + j]).powi(2);
+            // whatever the phase
+            let wave = |(w, wave): (usize, &Wave)| {
+                let k = self.flawed + 2 * w;
+                let open = 0.5 * (self.system.small[(k, k)] + self.system.small[(k + 1, k + 1)]);
+                lever(wave.joint) * open * ripple::PRIOR_RAD.powi(2)
+            };
+            (0..3).map(|j| lever(j) * lost(j)).sum::<f64>() + waves.iter().enumerate().map(wave).sum::<f64>()
+        })
+    }
+}
+
 /// A fitted process, ready for queries.
 #[derive(Clone, Debug)]
 pub(crate) struct Gp {
@@ -712,38 +866,7 @@ impl Gp {
     }
 
     fn bake(points: &Points, choice: &Choice) -> Option<Self> {
-        let n = points.places.len();
-        let flaws = points.flaws(choice.flawed.as_ref());
-        let (known, flawed) = (flaws.placed, flaws.columns.ncols());
-        let columns = columns(points, choice.flawed.as_ref(), choice.ripple.as_ref());
-        let system = System::new(points, [choice.across, choice.along], columns)?;
-        let weights = system.times(&stacked(&points.residuals));
-        let coefficients = system.columns.tr_mul(&weights);
-        let swings = coefficients.rows_range(flawed..) * ripple::PRIOR_RAD;
-        let lost = coefficients.rows_range(known..flawed).into_owned();
-        // variance of each wave's swing, whatever its phase, rad²
-        let waves = choice.ripple.as_ref().map_or(&[][..], |r| &r.waves);
-        let open = |k: usize| 0.5 * (system.small[(k, k)] + system.small[(k + 1, k + 1)]) * ripple::PRIOR_RAD.powi(2);
-        let open: Vec<(usize, f64)> = waves.iter().enumerate().map(|(w, wave)| (wave.joint, open(flawed + 2 * w))).collect();
-        // what flaws do to a place in the camera's frame, along its ray: a row a component; and the variance of what is too short for
-        // the nodes: of waves, and of lost motion, since nobody knows from where the joints will come
-        let flaws_at = |camera: Vector3<f64>| -> (DMatrix<f64>, [f64; 3]) {
-            let Some(arm) = &choice.flawed else {
-                return (DMatrix::zeros(3, 0), [0.0; 3]);
-            };
-            let frame = ray_frame(&points.motion, &camera);
-            let base = (points.motion * Point3::from(camera)).coords;
-            let moved = arm.flaws(base);
-            let levers = arm.pose(base).levers;
-            let short = [0, 1, 2].map(|a| {
-                let lever = |j: usize| levers[j].dot(&frame[a]).powi(2);
-                let lost = (0..3).map(|j| lever(j) * (LOST_RAD * lost[j]).powi(2)).sum::<f64>();
-                lost + open.iter().map(|(j, variance)| lever(*j) * variance).sum::<f64>()
-            });
-            (DMatrix::from_fn(3, known, |a, k| moved[k].dot(&frame[a])), short)
-        };
-        let certain = system.small.view((0, 0), (known, known)).into_owned();
-        let reach = [0, 1, 2].map(|a| system.solved.view((a * n, 0), (n, known)).into_owned());
+        let exact = Exact::new(points, choice)?;
         let margin = Vector3::repeat(MARGIN_MM / UNIT_MM);
         let (first, node) = (points.places[0], NODE_MM / UNIT_MM);
         let (low, high) = points
@@ -753,30 +876,15 @@ impl Gp {
         let (low, high) = (low - margin, high + margin);
         // an even number of steps: the variance has every second node
         let counts: [usize; 3] = ((high - low) / (2.0 * node)).map(|e| 2 * e.ceil() as usize + 1).into();
-        let place = |x: usize, y: usize, z: usize| low + Vector3::new(x as f64, y as f64, z as f64) * node;
-        let kernel = [choice.across, choice.along];
         let mut correction = Vec::with_capacity(counts.iter().product());
         let mut variance = Vec::new();
         for z in 0..counts[2] {
             for y in 0..counts[1] {
-                for x in 0..counts[0] {
-                    let at = place(x, y, z);
-                    let k = kernel.map(|k| DVector::from_fn(n, |i, _| k.of(&at, &points.places[i])));
-                    let (flaws, short) = flaws_at(points.centre + at * UNIT_MM);
-                    let part = |a: usize, k: &DVector<f64>| {
-                        k.dot(&weights.rows(a * n, n)) + flaws.row(a).tr_dot(&coefficients.rows(0, known))
-                    };
-                    correction.push(Vector3::new(part(0, &k[0]), part(1, &k[0]), part(2, &k[1])));
-                    if x % 2 + y % 2 + z % 2 == 0 {
-                        let of = |c: usize| (kernel[c].of(&at, &at) - k[c].dot(&(&system.blocks[c] * &k[c]))).max(0.0);
-                        // what is not known of the flaws, as far as it is not what the kernels take it for
-                        let open = |a: usize, k: &DVector<f64>| {
-                            let left = flaws.row(a).transpose() - reach[a].tr_mul(k);
-                            left.dot(&(&certain * &left))
-                        };
-                        let across = 0.5 * (open(0, &k[0]) + open(1, &k[0]));
-                        variance.push([of(0) + across, of(1) + open(2, &k[1]), 0.5 * (short[0] + short[1]), short[2]]);
-                    }
+                let place = |x: usize| low + Vector3::new(x as f64, y as f64, z as f64) * node;
+                let row: Vec<At> = (0..counts[0]).map(|x| exact.at(place(x))).collect();
+                correction.extend(row.iter().map(|at| exact.correction(at)));
+                if y % 2 + z % 2 == 0 {
+                    variance.extend(exact.variances(row.into_iter().step_by(2).collect()));
                 }
             }
         }
@@ -787,12 +895,39 @@ impl Gp {
             correction,
             variance,
             ripple: choice.ripple.clone(),
-            swings: (0..swings.len() / 2)
-                .map(|k| [swings[2 * k], swings[2 * k + 1]])
-                .collect(),
-            noise_mm: kernel.map(|k| k.noise_mm),
+            swings: exact.swings(),
+            noise_mm: [choice.across, choice.along].map(|k| k.noise_mm),
             scale: choice.scale,
         })
+    }
+
+    /// How far places of the camera's frame are from where they would be without baking, mm.
+    pub(crate) fn baking_errors(
+        &self,
+        camera: &[Vector3<f64>],
+        command: &[Vector3<f64>],
+        stances: Option<Vec<Stance>>,
+        choice: &Choice,
+        asked: &[Vector3<f64>],
+    ) -> Option<Vec<f64>> {
+        let points = Points::new(self.motion, camera, command, stances);
+        let exact = Exact::new(&points, choice)?;
+        let error = |at: &Vector3<f64>| {
+            let correction = exact.correction(&exact.at((at - points.centre) / UNIT_MM));
+            (self.shifted(*at, correction) - self.at(*at).base).norm()
+        };
+        Some(asked.iter().map(error).collect())
+    }
+
+    /// Where a camera point is in the base frame if the smooth part of its correction, along its ray, is this.
+    fn shifted(&self, camera: Vector3<f64>, correction: Vector3<f64>) -> Vector3<f64> {
+        let frame = ray_frame(&self.motion, &camera);
+        let mut base = (self.motion * Point3::from(camera)).coords;
+        base += frame[0] * correction.x + frame[1] * correction.y + frame[2] * correction.z;
+        if let Some(ripple) = &self.ripple {
+            base += ripple.shift(base, &self.swings);
+        }
+        base
     }
 
     /// Where a camera point is in the base frame; outside the baked box, as at its border.
@@ -800,13 +935,7 @@ impl Gp {
         let place: [f64; 3] = std::array::from_fn(|a| {
             ((camera[a] - self.low[a]) / NODE_MM).clamp(0.0, self.counts[a] as f64 - 1.000_001)
         });
-        let local = self.cubic(place);
-        let frame = ray_frame(&self.motion, &camera);
-        let mut base = (self.motion * Point3::from(camera)).coords;
-        base += frame[0] * local.x + frame[1] * local.y + frame[2] * local.z;
-        if let Some(ripple) = &self.ripple {
-            base += ripple.shift(base, &self.swings);
-        }
+        let base = self.shifted(camera, self.cubic(place));
         let variance = self.linear(place);
         Answer {
             base,

@@ -470,6 +470,21 @@ impl Map {
         }
     }
 
+    /// How far baking moves the answers of a `gp` map at places of the camera's frame, 3D, mm: what queries of a microsecond cost. Nothing
+    /// for other methods. Takes as long as baking does.
+    pub fn baking_errors_mm(&self, places: &[Point<Camera>]) -> Vec<f64> {
+        let (Some(gp), Some(choice)) = (&self.gp, &self.file.gp) else {
+            return Vec::new();
+        };
+        let points: Vec<&Support> = choice.points.iter().map(|&i| &self.file.points[i]).collect();
+        let camera: Vec<_> = points.iter().map(|p| p.camera.vector()).collect();
+        let command: Vec<_> = points.iter().map(|p| p.command.vector()).collect();
+        let stances = points.iter().map(|p| p.stance()).collect();
+        let asked: Vec<_> = places.iter().map(|p| p.vector()).collect();
+        gp.baking_errors(&camera, &command, stances, choice, &asked)
+            .unwrap_or_default()
+    }
+
     /// Writes the map, aside and then renamed.
     ///
     /// # Errors
@@ -644,6 +659,13 @@ impl Map {
         &self.file.held_out
     }
 
+    /// Noise of one measurement such as the pairs', as their likelihood tells it apart from what is smooth or ripple: standard deviation
+    /// along each axis across the viewing ray, and along it, mm. Only a `gp` map knows it.
+    pub fn noise_mm(&self) -> Option<[f64; 2]> {
+        let choice = self.file.gp.as_ref()?;
+        Some([choice.across.noise_mm, choice.along.noise_mm])
+    }
+
     /// Hash of the pairs that it was fitted to (of their contract CSV).
     pub fn pairs_sha256(&self) -> &str {
         &self.file.pairs_sha256
@@ -722,8 +744,13 @@ fn gaussian(stances: &[Option<Stance>], points: &Points, keep: &mut [bool]) -> R
         return Err(too_few);
     }
     // doubted points have another chance, unless there are more than enough of the others
-    let asked: Vec<usize> = (0..keep.len()).filter(|&i| keep[i] || keep.len() <= gp::MOST_POINTS).collect();
-    let used: Vec<usize> = spread(asked.len(), gp::MOST_POINTS).into_iter().map(|k| asked[k]).collect();
+    let asked: Vec<usize> = (0..keep.len())
+        .filter(|&i| keep[i] || keep.len() <= gp::MOST_POINTS)
+        .collect();
+    let used: Vec<usize> = spread(asked.len(), gp::MOST_POINTS)
+        .into_iter()
+        .map(|k| asked[k])
+        .collect();
     let of = |all: &[Vector3<f64>]| -> Vec<Vector3<f64>> { used.iter().map(|&i| all[i]).collect() };
     let stances: Option<Vec<_>> = used.iter().map(|&i| stances[points.index[i]]).collect();
     let command = of(&points.command);

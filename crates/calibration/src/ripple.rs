@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 /// Standard deviation of a wave's cosine and sine before anything is measured, rad: a tenth of a millimetre at the tool.
 pub(crate) const PRIOR_RAD: f64 = 1e-4;
 /// Waves that may be kept.
-pub(crate) const MOST_WAVES: usize = 10;
+pub(crate) const MOST_WAVES: usize = 8;
 /// Waves of one joint are at least so many cycles a turn apart.
 pub(crate) const APART: f64 = 2.0;
 
