@@ -1,7 +1,10 @@
 //! Fits maps to a file of pairs and measures them on queries whose true command is known (columns `true_cmd_*_mm`), one
 //! line a method. For comparing methods on recorded or simulated runs.
 //!
-//! `cargo run --release -p calibration --example measure_pairs -- PAIRS.csv QUERIES.csv`
+//! `cargo run --release -p calibration --example measure_pairs -- PAIRS.csv QUERIES.csv [NOISE.csv]`
+//!
+//! The noise of a measurement is what the pairs' likelihood says it is; NOISE.csv are pairs of the same cameras with as many frames a
+//! point that tell it better, since they are more.
 
 mod common;
 
@@ -16,10 +19,14 @@ use std::{error::Error, path::Path, time::Instant};
 
 fn main() -> Result<(), Box<dyn Error>> {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
-    let [pairs, queries] = arguments.as_slice() else {
-        return Err("usage: measure_pairs PAIRS.csv QUERIES.csv".into());
+    let (pairs, queries, telling) = match arguments.as_slice() {
+        [pairs, queries] => (pairs, queries, pairs),
+        [pairs, queries, telling] => (pairs, queries, telling),
+        _ => return Err("usage: measure_pairs PAIRS.csv QUERIES.csv [NOISE.csv]".into()),
     };
     let pairs = read_pairs(Path::new(pairs))?;
+    let (telling, _) = Map::fit(&read_pairs(Path::new(telling))?, &Settings::default())?;
+    let noise = telling.noise_mm().ok_or("a gp map knows its noise")?;
     let truth = read_truth(queries)?;
     let queries = read_queries(Path::new(queries))?;
     for (name, method, as_published) in METHODS {
@@ -47,8 +54,8 @@ fn main() -> Result<(), Box<dyn Error>> {
         if method == Method::Gp {
             println!("\n{report}\n");
             let (_, diagnosis) = diagnose(&pairs, &settings)?;
-            with_noise(&map, &queries, &truth);
-            after_a_bump(&map, &queries, &truth)?;
+            with_noise(&map, noise, &queries, &truth);
+            after_a_bump(&map, noise, &queries, &truth)?;
             println!(
                 "gp, left-out pairs in the stated 95 % interval: {:.1} % (n = {})\n",
                 100.0 * diagnosis.coverage[1],
@@ -69,10 +76,10 @@ fn measured(at: Point<Camera>, [lateral_mm, depth_mm]: [f64; 2], rng: &mut Pcg64
 }
 
 /// A point that is measured twice as long as the pairs were: twice the frames.
-fn with_noise(map: &Map, queries: &[Query], truth: &[Point<Base>]) {
+fn with_noise(map: &Map, noise: [f64; 2], queries: &[Query], truth: &[Point<Base>]) {
     let rng = &mut Pcg64Mcg::seed_from_u64(1);
-    let Some([lateral, depth]) = map.noise_mm() else { return };
-    let twice = [lateral, depth].map(|s| s / 2f64.sqrt());
+    let [lateral, depth] = noise;
+    let twice = noise.map(|s| s / 2f64.sqrt());
     let rows = || queries.iter().zip(truth);
     let errors = (0..20)
         .flat_map(|_| rows())
@@ -84,9 +91,8 @@ fn with_noise(map: &Map, queries: &[Query], truth: &[Point<Base>]) {
 }
 
 /// The camera is pushed by 1 mm and turned by 2 mrad; ten fresh points; the other queries, 20 times over.
-fn after_a_bump(map: &Map, queries: &[Query], truth: &[Point<Base>]) -> Result<(), Box<dyn Error>> {
+fn after_a_bump(map: &Map, noise: [f64; 2], queries: &[Query], truth: &[Point<Base>]) -> Result<(), Box<dyn Error>> {
     let rng = &mut Pcg64Mcg::seed_from_u64(2);
-    let noise = map.noise_mm().unwrap_or_default();
     let (mut before, mut after) = (Errors::default(), Errors::default());
     for trial in 0..20 {
         let bump = Isometry3::new(gauss3(rng).normalize(), 2e-3 * gauss3(rng).normalize());

@@ -55,15 +55,21 @@ pub(crate) struct Pose {
 impl Arm {
     /// The arm whose commands and joint angles these are; `None` if its tool did not keep its direction, or they are too few to learn from.
     pub(crate) fn of(command: &[Vector3<f64>], joints: &[[f64; 3]]) -> Option<Self> {
-        Self::gp25(command, joints).or_else(|| Polynomial::fit(command, joints).map(Arm::Learned))
+        let learned = |_| Polynomial::fit(command, joints).map(Arm::Learned);
+        Self::gp25(command, joints).map_or_else(learned, Some)
     }
 
-    fn gp25(command: &[Vector3<f64>], joints: &[[f64; 3]]) -> Option<Self> {
+    /// A GP25, or how far the pairs' angles are from those of one with a tool that keeps its direction, mm.
+    pub(crate) fn gp25(command: &[Vector3<f64>], joints: &[[f64; 3]]) -> Result<Self, f64> {
         let offsets: Vec<_> = command.iter().zip(joints).map(|(p, q)| p - wrist(*q)).collect();
         let n = offsets.len().max(1) as f64;
         let mean = offsets.iter().sum::<Vector3<f64>>() / n;
         let scatter = (offsets.iter().map(|o| (o - mean).norm_squared()).sum::<f64>() / n).sqrt();
-        (scatter < SAME_TOOL_MM).then_some(Arm::Gp25 { wrist_to_tool_mm: mean })
+        if scatter < SAME_TOOL_MM {
+            Ok(Arm::Gp25 { wrist_to_tool_mm: mean })
+        } else {
+            Err(scatter)
+        }
     }
 
     /// Joints and levers for a commanded point.

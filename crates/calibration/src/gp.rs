@@ -614,8 +614,7 @@ fn scales(points: &Points, arm: Option<&Arm>, start: [Kernel; 2]) -> Option<[f64
             squares[1].push(along);
         }
     }
-    // the 90 % of all that matter for an interval, without the few that make it too wide
-    Some(squares.map(|s| (crate::rigid::quantile(s, 0.9).sqrt() / 1.6449).clamp(0.5, 3.0)))
+    Some(squares.map(|s| crate::rigid::quantile(s, 0.6827).sqrt().clamp(0.5, 3.0)))
 }
 
 /// How many sigmas an error is, of its squares in sigmas: across the ray, twice, and along it.
@@ -947,16 +946,16 @@ impl Gp {
         }
     }
 
-    /// Catmull-Rom between the nodes: its first derivative has no steps.
+    /// The cubics through four nodes along each axis (Lagrange): four times as close as those whose slope has no steps at the nodes, which
+    /// here are smaller than anything that can be measured.
     fn cubic(&self, place: [f64; 3]) -> Vector3<f64> {
         let taps = place.map(|p| {
             let (i, t) = (p as usize, p.fract());
-            let (t2, t3) = (t * t, t * t * t);
             let weights = [
-                0.5 * (-t3 + 2.0 * t2 - t),
-                0.5 * (3.0 * t3 - 5.0 * t2 + 2.0),
-                0.5 * (-3.0 * t3 + 4.0 * t2 + t),
-                0.5 * (t3 - t2),
+                -t * (t - 1.0) * (t - 2.0) / 6.0,
+                (t + 1.0) * (t - 1.0) * (t - 2.0) / 2.0,
+                -(t + 1.0) * t * (t - 2.0) / 2.0,
+                (t + 1.0) * t * (t - 1.0) / 6.0,
             ];
             (i, weights)
         });

@@ -55,6 +55,17 @@ impl Method {
     }
 }
 
+/// Where J1 to J3 at a query come from.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ArmModel {
+    /// From the kinematics of a GP25 where the pairs' joint angles are of one, else from a regression on them.
+    #[default]
+    FromPairs,
+    /// From the kinematics of a GP25; pairs with other joint angles are refused.
+    Gp25,
+}
+
 /// Whose map it is: a map is true for one arm and one camera only.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Identity {
@@ -78,6 +89,9 @@ pub struct Settings {
     /// Exactly as published: no rejection, no fallback, steps between neighbourhoods. For comparison.
     #[serde(default)]
     pub as_published: bool,
+    /// Where joint angles at a query come from, where the pairs have any (method `gp`).
+    #[serde(default)]
+    pub arm_model: ArmModel,
     /// The arm and the camera that the pairs come from.
     pub identity: Identity,
     /// When the pairs were taken, RFC 3339.
@@ -185,8 +199,9 @@ pub enum MapError {
 }
 
 const FORMAT: &str = "unscrew-map";
-const VERSION: u64 = 3;
-/// What a map without layers is written as: programs of before read it.
+const VERSION: u64 = 4;
+/// What a map with layers is written as, if nothing is known of its arm's flaws, and what one without layers: programs of before read them.
+const VERSION_WITHOUT_FLAWS: u64 = 3;
 const VERSION_WITHOUT_LAYERS: u64 = 2;
 
 /// Standard deviation of one measurement about the map for each level of the fallback: across the ray and along it, mm.
@@ -281,7 +296,7 @@ impl Map {
         };
         let stances = stances(pairs);
         let fitted = match method {
-            Method::Gp => Some(gaussian(&stances, &points, &mut keep)?),
+            Method::Gp => Some(gaussian(settings.arm_model, &stances, &points, &mut keep)?),
             _ => None,
         };
         let used: Vec<usize> = (0..keep.len()).filter(|&i| keep[i]).collect();
@@ -380,7 +395,7 @@ impl Map {
             .fold((command[0], command[0]), |(l, h), p| (l.inf(p), h.sup(p)));
         let file = MapFile {
             format: FORMAT.into(),
-            version: VERSION_WITHOUT_LAYERS,
+            version: if armed { VERSION } else { VERSION_WITHOUT_LAYERS },
             made_by: concat!("unscrew ", env!("CARGO_PKG_VERSION")).into(),
             pairs_sha256: format!("sha256:{}", geometry::sha256_hex(pair::to_csv(pairs).as_bytes())),
             settings: settings.clone(),
@@ -570,21 +585,7 @@ impl Map {
     /// As for [`load`](Self::load), [`MapError::WrongCamera`], [`MapError::WrongArm`], [`MapError::FailedCheck`].
     pub fn load_for(path: &Path, identity: &Identity) -> Result<Self, MapError> {
         let map = Self::load(path)?;
-        let Identity { arm, camera } = map.identity();
-        if *camera != identity.camera {
-            return Err(MapError::WrongCamera {
-                path: path.into(),
-                found: camera.clone(),
-                wanted: identity.camera.clone(),
-            });
-        }
-        if *arm != identity.arm {
-            return Err(MapError::WrongArm {
-                path: path.into(),
-                found: arm.clone(),
-                wanted: identity.arm.clone(),
-            });
-        }
+        map.belongs_to(Some(&identity.arm), Some(&identity.camera), path)?;
         if let Some(check) = map.file.checked.as_ref().filter(|c| !c.passed) {
             return Err(MapError::FailedCheck {
                 path: path.into(),
@@ -595,16 +596,40 @@ impl Map {
         Ok(map)
     }
 
+    /// Makes sure that a map, which was read from `path`, is of this arm and of this camera (see [`camera_identity`]), as far as they are
+    /// given.
+    ///
+    /// # Errors
+    /// [`MapError::WrongCamera`], [`MapError::WrongArm`].
+    pub fn belongs_to(&self, arm: Option<&str>, camera: Option<&str>, path: &Path) -> Result<(), MapError> {
+        let own = self.identity();
+        if let Some(wanted) = camera.filter(|c| *c != own.camera) {
+            return Err(MapError::WrongCamera {
+                path: path.into(),
+                found: own.camera.clone(),
+                wanted: wanted.into(),
+            });
+        }
+        if let Some(wanted) = arm.filter(|a| *a != own.arm) {
+            return Err(MapError::WrongArm {
+                path: path.into(),
+                found: own.arm.clone(),
+                wanted: wanted.into(),
+            });
+        }
+        Ok(())
+    }
+
     pub(crate) fn with_layer(&self, layer: realign::Layer) -> Self {
         let mut map = self.clone();
-        (map.file.version, map.file.realigned) = (VERSION, Some(layer));
+        (map.file.version, map.file.realigned) = (map.file.version.max(VERSION_WITHOUT_FLAWS), Some(layer));
         map.file.checked = None; // of how it was before
         map
     }
 
     pub(crate) fn with_correction(&self, layer: correct::Layer) -> Self {
         let mut map = self.clone();
-        (map.file.version, map.file.correction) = (VERSION, Some(layer));
+        (map.file.version, map.file.correction) = (map.file.version.max(VERSION_WITHOUT_FLAWS), Some(layer));
         map
     }
 
@@ -623,7 +648,7 @@ impl Map {
     /// The map with what a check said of it.
     pub fn with_check(&self, check: Check) -> Self {
         let mut map = self.clone();
-        (map.file.version, map.file.checked) = (VERSION, Some(check));
+        (map.file.version, map.file.checked) = (map.file.version.max(VERSION_WITHOUT_FLAWS), Some(check));
         map
     }
 
@@ -732,7 +757,12 @@ fn stances(pairs: &[Pair]) -> Vec<Option<Stance>> {
 }
 
 /// The Gaussian process of the points that are believed, or of as many of them as it needs; `keep` says which are, before and after.
-fn gaussian(stances: &[Option<Stance>], points: &Points, keep: &mut [bool]) -> Result<gp::Fitted, FitError> {
+fn gaussian(
+    model: ArmModel,
+    stances: &[Option<Stance>],
+    points: &Points,
+    keep: &mut [bool],
+) -> Result<gp::Fitted, FitError> {
     let believed = keep.iter().filter(|&&k| k).count();
     let method = Method::Gp;
     let too_few = FitError::TooFew {
@@ -754,10 +784,14 @@ fn gaussian(stances: &[Option<Stance>], points: &Points, keep: &mut [bool]) -> R
     let of = |all: &[Vector3<f64>]| -> Vec<Vector3<f64>> { used.iter().map(|&i| all[i]).collect() };
     let stances: Option<Vec<_>> = used.iter().map(|&i| stances[points.index[i]]).collect();
     let command = of(&points.command);
-    let arm = stances.as_ref().and_then(|stances| {
-        let joints: Vec<_> = stances.iter().map(|s| s.joints_rad).collect();
-        Arm::of(&command, &joints)
-    });
+    let joints: Option<Vec<_>> = stances.as_ref().map(|s| s.iter().map(|s| s.joints_rad).collect());
+    let arm = match (model, &joints) {
+        (_, None) => None,
+        (ArmModel::FromPairs, Some(joints)) => Arm::of(&command, joints),
+        (ArmModel::Gp25, Some(joints)) => {
+            Some(Arm::gp25(&command, joints).map_err(|scatter_mm| FitError::NotThisArm { scatter_mm })?)
+        }
+    };
     let at_first = used.iter().map(|&i| keep[i]).collect();
     let mut fitted = gp::fit(&of(&points.camera), &command, stances.as_deref(), arm, at_first).ok_or(too_few)?;
     for (&i, &kept) in used.iter().zip(&fitted.keep) {
