@@ -16,6 +16,8 @@ const UNIT_MM: f64 = 500.0;
 const AFFINE_MM: f64 = 10.0;
 /// Points by which a kernel is chosen; more say little more and take their number to the third power of time.
 const KERNEL_POINTS: usize = 180;
+/// What changes over less than points are apart cannot be told from noise, and could not be baked, mm.
+const SHORTEST_MM: f64 = 120.0;
 /// With more points than this, half of them tell how true sigma is.
 const MANY_POINTS: usize = 150;
 /// Points that the process rests on.
@@ -87,7 +89,7 @@ impl Kernel {
     fn best(self, cost: impl Fn(Self) -> f64, trials: usize) -> Self {
         let kernel = |x: &Vector3<f64>| Self {
             smooth_mm: x[0].clamp(-7.0, 3.0).exp(),
-            length_mm: x[1].clamp(3.5, 9.0).exp(),
+            length_mm: x[1].exp().clamp(SHORTEST_MM, 8000.0),
             noise_mm: x[2].exp().clamp(crate::lattice::FLOOR_MM, 10.0),
         };
         let at = Vector3::new(self.smooth_mm.ln(), self.length_mm.ln(), self.noise_mm.ln());
