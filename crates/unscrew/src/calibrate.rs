@@ -6,7 +6,8 @@ use calibration::{
     ArmModel, Between, Check, HandEye, Identity, Map, Method, Moved, PlanError, Settings, Target, Volume,
     camera_identity, diagnose, lattice, read_marks, read_pairs, read_queries, rigid_figures, scattered, verify,
 };
-use cell::motion::{ArmMotion, CellDrawing, DrawnUnit};
+use cell::CellConfig;
+use cell::motion::{ArmMotion, CellDrawing, DrawnUnit, Gp25};
 use geometry::{Base, Point, read_camera_info};
 use serde::Serialize;
 use sim::layout;
@@ -106,8 +107,12 @@ pub struct Plan {
     /// Opposite corners of the volume in the robot's base, mm: x,y,z,x,y,z
     #[arg(long, value_name = "CORNERS", allow_hyphen_values = true, default_value = "950,-450,150,1350,450,900", value_parser = volume)]
     volume_mm: Volume,
-    /// Arm of the cell as drawn whose reach, wrist and surroundings the places are checked against: arm_a or arm_b
-    #[arg(long, default_value = "arm_a")]
+    /// Cell file whose drawing (`[motion]`) the arm has to stay clear of, on an empty table; without it only reach, joint limits and the
+    /// wrist singularity of a GP25 are looked at
+    #[arg(long, value_name = "FILE")]
+    cell: Option<PathBuf>,
+    /// The arm in that drawing
+    #[arg(long, default_value = "arm_a", requires = "cell")]
     arm: String,
     /// As JSON
     #[arg(long)]
@@ -329,7 +334,7 @@ pub fn run(command: &Command) -> Result<Ended> {
 
 fn plan(args: &Plan) -> Result<Ended> {
     let targets = args.visits.over(&args.volume_mm)?;
-    let targets = reachable(targets, &args.arm)?;
+    let targets = reachable(targets, args.cell.as_deref(), &args.arm)?;
     if args.json {
         println!(
             "{}",
@@ -358,37 +363,40 @@ const APPROACH_MM_S: f64 = 100.0;
 /// What is kept between the arm and the cell, mm.
 const MARGIN_MM: f64 = 5.0;
 
-/// The places that the arm reaches with the tool along the camera's view, clear of the wrist singularity and of the cell as drawn; the others
-/// are said and left out.
-fn reachable(targets: Vec<Target>, arm: &str) -> Result<Vec<Target>> {
-    // a calibration is on an empty table, with one arm at a time at its own pace
-    let drawn = CellDrawing::default();
-    let empty = CellDrawing {
-        margin_mm: MARGIN_MM,
-        unit: DrawnUnit {
-            face_mm: [1.0; 2],
-            depth_mm: 1.0,
-            ..drawn.unit.clone()
-        },
-        ..drawn
-    };
-    let Some(motion) = ArmMotion::new(&empty, arm) else {
-        bail!("the drawn cell has no arm '{arm}'; it has arm_a and arm_b");
+/// The places that the arm reaches with the tool along the camera's view, clear of the wrist singularity and, where a cell is given, of what
+/// it has drawn; the others are said and left out.
+fn reachable(targets: Vec<Target>, cell: Option<&Path>, arm: &str) -> Result<Vec<Target>> {
+    let motion = cell.map(|path| in_cell(path, arm)).transpose()?;
+    let gp25 = Gp25::new(layout::flange_from_tool());
+    let why_not = |command: Point<Base>| -> Option<String> {
+        let contact = layout::tool_at(command);
+        // the tool looks along x
+        let [x, y, z] = command.to_array();
+        let before = layout::tool_at(Point::new(x - STANDOFF_MM, y, z));
+        match &motion {
+            Some(motion) => {
+                let way = motion.check(motion.home_rad(), before, contact, APPROACH_MM_S);
+                way.err().map(|refusal| refusal.to_string())
+            }
+            None => {
+                let poses = [before, contact];
+                poses
+                    .into_iter()
+                    .find_map(|pose| gp25.inverse(pose).err())
+                    .map(|e| e.to_string())
+            }
+        }
     };
     let planned = targets.len();
     let (mut left, mut reason) = (Vec::with_capacity(planned), None);
     let bar = output::progress(planned as u64, "places checked");
     for target in targets {
-        let contact = layout::tool_at(target.command);
-        // the tool looks along x
-        let [x, y, z] = target.command.to_array();
-        let before = layout::tool_at(Point::new(x - STANDOFF_MM, y, z));
-        match motion.check(motion.home_rad(), before, contact, APPROACH_MM_S) {
-            Ok(_) => left.push(Target {
+        match why_not(target.command) {
+            None => left.push(Target {
                 id: left.len() as u64,
                 ..target
             }),
-            Err(refusal) => reason = Some(refusal),
+            Some(why) => reason = Some(why),
         }
         bar.inc(1);
     }
@@ -402,6 +410,25 @@ fn reachable(targets: Vec<Target>, arm: &str) -> Result<Vec<Target>> {
     }
     eprintln!("unscrew: {out} of {planned} places are left out, such as one where {reason}");
     Ok(left)
+}
+
+/// An arm of a cell as drawn. A calibration is on an empty table, with one arm at a time at its own pace.
+fn in_cell(path: &Path, arm: &str) -> Result<ArmMotion> {
+    let drawn = CellConfig::read(path)?.motion;
+    let names: Vec<String> = drawn.arms.iter().map(|a| a.name.clone()).collect();
+    let empty = CellDrawing {
+        margin_mm: MARGIN_MM,
+        unit: DrawnUnit {
+            face_mm: [1.0; 2],
+            depth_mm: 1.0,
+            ..drawn.unit
+        },
+        ..drawn
+    };
+    match ArmMotion::new(&empty, arm) {
+        Some(motion) => Ok(motion),
+        None => bail!("{} draws no arm '{arm}'; it has {}", path.display(), names.join(", ")),
+    }
 }
 
 fn capture(args: &Capture) -> Result<Ended> {
