@@ -105,7 +105,9 @@ impl Arm {
                 flaws.push(axis.cross(&(command - end)) * TURN_RAD);
             }
         }
-        let out = |of: Vector3<f64>| of.xy().norm() / 1000.0;
+        // with its sign: an elbow may lean back behind the base's axis
+        let radial = column * Vector3::x();
+        let out = |of: Vector3<f64>| radial.dot(&of) / 1000.0;
         let [_, lower, upper] = [0, 1, 2].map(|joint| lever(command, joints_rad, joint));
         flaws.push(lower * (BEND_RAD * (out(elbow) - out(shoulder))));
         flaws.push(lower * (BEND_RAD * (out(wrist) - out(elbow))));
