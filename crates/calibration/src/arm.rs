@@ -3,7 +3,7 @@
 //! For a Yaskawa GP25 by its kinematics; for any other arm by a regression on the joint angles of the pairs themselves. Both
 //! rest on a tool that keeps its direction, as it does while a marker is shown to the camera.
 
-use nalgebra::{DMatrix, Matrix3, Vector3};
+use nalgebra::{DMatrix, Matrix3, UnitQuaternion, Vector3};
 use serde::{Deserialize, Serialize};
 use std::f64::consts::FRAC_PI_2;
 
@@ -27,6 +27,12 @@ const ENOUGH: usize = 250;
 const NUGGET: f64 = 1e-10;
 /// Joint angles that a polynomial tells no better than this cannot place a wave of a hundred cycles a turn, rad.
 const GOOD_ENOUGH_RAD: f64 = 1.5e-3;
+/// What is expected of an arm's flaws before anything is measured: of its lengths, mm, of its axes and zeros, rad, and of what bends J2
+/// and J3 for each metre that their load reaches out, rad.
+const LINK_MM: f64 = 0.5;
+const TURN_RAD: f64 = 5e-4;
+const BEND_RAD: f64 = 2e-3;
+
 /// J1 to J3 over places of the tool.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(untagged)]
@@ -49,15 +55,21 @@ pub(crate) struct Pose {
 impl Arm {
     /// The arm whose commands and joint angles these are; `None` if its tool did not keep its direction, or they are too few to learn from.
     pub(crate) fn of(command: &[Vector3<f64>], joints: &[[f64; 3]]) -> Option<Self> {
-        Self::gp25(command, joints).or_else(|| Polynomial::fit(command, joints).map(Arm::Learned))
+        let learned = |_| Polynomial::fit(command, joints).map(Arm::Learned);
+        Self::gp25(command, joints).map_or_else(learned, Some)
     }
 
-    fn gp25(command: &[Vector3<f64>], joints: &[[f64; 3]]) -> Option<Self> {
+    /// A GP25, or how far the pairs' angles are from those of one with a tool that keeps its direction, mm.
+    pub(crate) fn gp25(command: &[Vector3<f64>], joints: &[[f64; 3]]) -> Result<Self, f64> {
         let offsets: Vec<_> = command.iter().zip(joints).map(|(p, q)| p - wrist(*q)).collect();
         let n = offsets.len().max(1) as f64;
         let mean = offsets.iter().sum::<Vector3<f64>>() / n;
         let scatter = (offsets.iter().map(|o| (o - mean).norm_squared()).sum::<f64>() / n).sqrt();
-        (scatter < SAME_TOOL_MM).then_some(Arm::Gp25 { wrist_to_tool_mm: mean })
+        if scatter < SAME_TOOL_MM {
+            Ok(Arm::Gp25 { wrist_to_tool_mm: mean })
+        } else {
+            Err(scatter)
+        }
     }
 
     /// Joints and levers for a commanded point.
@@ -70,6 +82,37 @@ impl Arm {
             }
             Arm::Learned(polynomial) => polynomial.pose(command),
         }
+    }
+
+    /// How a commanded point is missed, mm, by each flaw that an arm has, in the size that is to be expected: every link longer and
+    /// turned, J2 and J3 bent by what they carry. Nothing is known of the flaws of another arm.
+    pub(crate) fn flaws(&self, command: Vector3<f64>) -> Vec<Vector3<f64>> {
+        let Arm::Gp25 { wrist_to_tool_mm } = self else {
+            return Vec::new();
+        };
+        let wrist = command - wrist_to_tool_mm;
+        let joints_rad @ [j1, j2, j3] = joints(wrist);
+        let turn = |axis: Vector3<f64>, angle: f64| UnitQuaternion::from_scaled_axis(axis * angle);
+        let column = turn(Vector3::z(), j1);
+        let upper = column * turn(Vector3::y(), j2);
+        let forearm = column * turn(Vector3::y(), j2 - j3 + FRAC_PI_2);
+        let shoulder = column * Vector3::new(A1_MM, 0.0, C1_MM);
+        let elbow = shoulder + upper * Vector3::new(0.0, 0.0, C2_MM);
+        let mut flaws = Vec::with_capacity(20);
+        for (link, end) in [(column, shoulder), (upper, elbow), (forearm, wrist)] {
+            for axis in [Vector3::x(), Vector3::y(), Vector3::z()].map(|a| link * a) {
+                flaws.push(axis * LINK_MM);
+                flaws.push(axis.cross(&(command - end)) * TURN_RAD);
+            }
+        }
+        // with its sign: an elbow may lean back behind the base's axis
+        let radial = column * Vector3::x();
+        let out = |of: Vector3<f64>| radial.dot(&of) / 1000.0;
+        let [_, lower, upper] = [0, 1, 2].map(|joint| lever(command, joints_rad, joint));
+        flaws.push(lower * (BEND_RAD * (out(elbow) - out(shoulder))));
+        flaws.push(lower * (BEND_RAD * (out(wrist) - out(elbow))));
+        flaws.push(upper * (BEND_RAD * (out(wrist) - out(elbow))));
+        flaws
     }
 }
 

@@ -6,6 +6,7 @@ use crate::{Figures, FitError, FitReport, Hull, Map, MappedPoint, Pair, Settings
 use geometry::{Base, Camera, Point};
 use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
+use std::collections::HashSet;
 
 /// A tenth of the pairs is left out at a time.
 const FOLDS: usize = 10;
@@ -100,7 +101,7 @@ pub struct Diagnosis {
 /// As [`Map::fit`].
 pub fn diagnose(pairs: &[Pair], settings: &Settings) -> Result<(Map, Diagnosis), FitError> {
     let (map, fit) = Map::fit(pairs, settings)?;
-    let doubted: std::collections::HashSet<u64> = fit.rejected.iter().map(|r| r.id).collect();
+    let doubted: HashSet<u64> = fit.rejected.iter().map(|r| r.id).collect();
     let valid: Vec<usize> = (0..pairs.len()).filter(|&i| pairs[i].valid).collect();
     let believed: Vec<usize> = valid
         .iter()
@@ -124,11 +125,7 @@ pub fn diagnose(pairs: &[Pair], settings: &Settings) -> Result<(Map, Diagnosis),
         .collect();
     for fold in 0..FOLDS {
         let left_out: Vec<usize> = order.iter().copied().skip(fold).step_by(FOLDS).collect();
-        let others: Vec<Pair> = valid
-            .iter()
-            .filter(|i| !left_out.contains(i))
-            .map(|&i| pairs[i].clone())
-            .collect();
+        let others = only(pairs, |i| !left_out.contains(&i));
         let (without, _) = Map::fit(&others, settings)?;
         for i in left_out {
             judge(&without, &pairs[i], &mut visits[i]);
@@ -166,6 +163,16 @@ pub fn diagnose(pairs: &[Pair], settings: &Settings) -> Result<(Map, Diagnosis),
     Ok((map, diagnosis))
 }
 
+/// The capture as if the marker had been missed at all other visits: where the arm came from is known all the same.
+fn only(pairs: &[Pair], chosen: impl Fn(usize) -> bool) -> Vec<Pair> {
+    let all = pairs.iter().enumerate();
+    all.map(|(i, p)| Pair {
+        valid: p.valid && chosen(i),
+        ..p.clone()
+    })
+    .collect()
+}
+
 fn judge(map: &Map, pair: &Pair, visit: &mut Judged) {
     let Some(camera) = pair.camera else { return };
     let mapped = map.apply(camera);
@@ -197,7 +204,10 @@ fn coverage<'a>(visits: impl Iterator<Item = &'a Judged>) -> [f64; 2] {
 /// Two maps from every other pair, compared where both know something.
 fn split_half(pairs: &[Pair], believed: &[usize], settings: &Settings, map: &Map) -> Option<Spread> {
     let order = spread(believed);
-    let half = |first: usize| -> Vec<Pair> { order.iter().skip(first).step_by(2).map(|&i| pairs[i].clone()).collect() };
+    let half = |first: usize| {
+        let own: HashSet<usize> = order.iter().copied().skip(first).step_by(2).collect();
+        only(pairs, |i| own.contains(&i))
+    };
     let (a, _) = Map::fit(&half(0), settings).ok()?;
     let (b, _) = Map::fit(&half(1), settings).ok()?;
     let camera_from_base = map.base_from_camera().inverse();
@@ -222,17 +232,15 @@ fn fewer(pairs: &[Pair], believed: &[usize], settings: &Settings) -> Vec<WithFew
     // something has to be left to predict
     for points in NUMBERS.into_iter().filter(|&n| n + 20 <= order.len()) {
         // every `stride`-th of the spread order, so that the fit and what it is asked are both spread
-        let picked: std::collections::HashSet<usize> = (0..points).map(|k| order[k * order.len() / points]).collect();
-        let of = |inside: bool| -> Vec<Pair> {
-            let of = order.iter().filter(|i| picked.contains(i) == inside);
-            of.map(|&i| pairs[i].clone()).collect()
-        };
-        let Ok((map, report)) = Map::fit(&of(true), settings) else {
+        let picked: HashSet<usize> = (0..points).map(|k| order[k * order.len() / points]).collect();
+        let Ok((map, report)) = Map::fit(&only(pairs, |i| picked.contains(&i)), settings) else {
             continue;
         };
-        let errors: Vec<_> = of(false)
+        let errors: Vec<_> = order
             .iter()
-            .filter_map(|p| {
+            .filter(|i| !picked.contains(i))
+            .filter_map(|&i| {
+                let p = &pairs[i];
                 let camera = p.camera?;
                 Some((map.apply(camera).base.vector() - p.command.vector(), map.ray(camera)))
             })

@@ -61,7 +61,7 @@ mod tps;
 pub use correct::{Between, CorrectError, Mark};
 pub use diagnose::{Diagnosis, Drift, Judged, WithFewer, diagnose, volume_covered};
 pub use lattice::Level;
-pub use map::{Check, Hull, Identity, Map, MapError, MappedPoint, Method, Settings, camera_identity};
+pub use map::{ArmModel, Check, Hull, Identity, Map, MapError, MappedPoint, Method, Settings, camera_identity};
 pub use pair::{Pair, PairError, PairWriter, Query, read_marks, read_pairs, read_queries, write_pairs};
 pub use plan::{PlanError, Target, Volume, lattice, node_counts, scattered};
 pub use pose::{HandEye, PoseError};

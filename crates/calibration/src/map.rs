@@ -4,7 +4,7 @@ use crate::{
     Figures, FitError, FitReport, Level, Pair, Rejected, Volume,
     arm::Arm,
     correct,
-    gp::{self, Choice, Gp},
+    gp::{self, Choice, Gp, Stance},
     lattice::{Estimate, Grid, LEVELS, MAX_LEVERAGE, Model, Shape, believable, split},
     pair, realign,
     rigid::{self, Points, quantile},
@@ -55,6 +55,17 @@ impl Method {
     }
 }
 
+/// Where J1 to J3 at a query come from.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ArmModel {
+    /// From the kinematics of a GP25 where the pairs' joint angles are of one, else from a regression on them.
+    #[default]
+    FromPairs,
+    /// From the kinematics of a GP25; pairs with other joint angles are refused.
+    Gp25,
+}
+
 /// Whose map it is: a map is true for one arm and one camera only.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Identity {
@@ -78,6 +89,9 @@ pub struct Settings {
     /// Exactly as published: no rejection, no fallback, steps between neighbourhoods. For comparison.
     #[serde(default)]
     pub as_published: bool,
+    /// Where joint angles at a query come from, where the pairs have any (method `gp`).
+    #[serde(default)]
+    pub arm_model: ArmModel,
     /// The arm and the camera that the pairs come from.
     pub identity: Identity,
     /// When the pairs were taken, RFC 3339.
@@ -185,8 +199,9 @@ pub enum MapError {
 }
 
 const FORMAT: &str = "unscrew-map";
-const VERSION: u64 = 3;
-/// What a map without layers is written as: programs of before read it.
+const VERSION: u64 = 4;
+/// What a map with layers is written as, if nothing is known of its arm's flaws, and what one without layers: programs of before read them.
+const VERSION_WITHOUT_FLAWS: u64 = 3;
 const VERSION_WITHOUT_LAYERS: u64 = 2;
 
 /// Standard deviation of one measurement about the map for each level of the fallback: across the ray and along it, mm.
@@ -239,6 +254,19 @@ struct Support {
     /// J1 to J3.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     joints_rad: Option<[f64; 3]>,
+    /// The sign of each one's last motion.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    came_from: Option<[f64; 3]>,
+}
+
+impl Support {
+    /// How the arm stood.
+    fn stance(&self) -> Option<Stance> {
+        Some(Stance {
+            joints_rad: self.joints_rad?,
+            came_from: self.came_from.unwrap_or_default(),
+        })
+    }
 }
 
 impl std::fmt::Debug for Map {
@@ -266,8 +294,9 @@ impl Map {
         } else {
             believable(&points, &motion, &grid)
         };
+        let stances = stances(pairs);
         let fitted = match method {
-            Method::Gp => Some(gaussian(pairs, &points, &mut keep)?),
+            Method::Gp => Some(gaussian(settings.arm_model, &stances, &points, &mut keep)?),
             _ => None,
         };
         let used: Vec<usize> = (0..keep.len()).filter(|&i| keep[i]).collect();
@@ -350,19 +379,23 @@ impl Map {
         if let Some(ripple) = fitted.as_ref().and_then(|f| f.choice.ripple.as_ref()) {
             report.notes.push(format!("ripple of the gears is taken out: {ripple}"));
         }
-        let ripple = fitted.as_ref().is_some_and(|f| f.choice.ripple.is_some());
-        let support = |(&i, (c, t)): (&usize, (&Vector3<f64>, &Vector3<f64>))| Support {
-            id: pairs[points.index[i]].id,
-            camera: Point::from_vector(*c),
-            command: Point::from_vector(*t),
-            joints_rad: first_joints(&pairs[points.index[i]]).filter(|_| ripple),
+        let armed = fitted.as_ref().is_some_and(|f| f.choice.flawed.is_some());
+        let support = |(&i, (c, t)): (&usize, (&Vector3<f64>, &Vector3<f64>))| {
+            let stance = stances[points.index[i]].filter(|_| armed);
+            Support {
+                id: pairs[points.index[i]].id,
+                camera: Point::from_vector(*c),
+                command: Point::from_vector(*t),
+                joints_rad: stance.map(|s| s.joints_rad),
+                came_from: stance.map(|s| s.came_from),
+            }
         };
         let (low, high) = command
             .iter()
             .fold((command[0], command[0]), |(l, h), p| (l.inf(p), h.sup(p)));
         let file = MapFile {
             format: FORMAT.into(),
-            version: VERSION_WITHOUT_LAYERS,
+            version: if armed { VERSION } else { VERSION_WITHOUT_LAYERS },
             made_by: concat!("unscrew ", env!("CARGO_PKG_VERSION")).into(),
             pairs_sha256: format!("sha256:{}", geometry::sha256_hex(pair::to_csv(pairs).as_bytes())),
             settings: settings.clone(),
@@ -452,6 +485,21 @@ impl Map {
         }
     }
 
+    /// How far baking moves the answers of a `gp` map at places of the camera's frame, 3D, mm: what queries of a microsecond cost. Nothing
+    /// for other methods. Takes as long as baking does.
+    pub fn baking_errors_mm(&self, places: &[Point<Camera>]) -> Vec<f64> {
+        let (Some(gp), Some(choice)) = (&self.gp, &self.file.gp) else {
+            return Vec::new();
+        };
+        let points: Vec<&Support> = choice.points.iter().map(|&i| &self.file.points[i]).collect();
+        let camera: Vec<_> = points.iter().map(|p| p.camera.vector()).collect();
+        let command: Vec<_> = points.iter().map(|p| p.command.vector()).collect();
+        let stances = points.iter().map(|p| p.stance()).collect();
+        let asked: Vec<_> = places.iter().map(|p| p.vector()).collect();
+        gp.baking_errors(&camera, &command, stances, choice, &asked)
+            .unwrap_or_default()
+    }
+
     /// Writes the map, aside and then renamed.
     ///
     /// # Errors
@@ -505,8 +553,8 @@ impl Map {
                 let points = points.ok_or_else(|| bad("it rests on points that it does not hold".into()))?;
                 let camera: Vec<_> = points.iter().map(|p| p.camera.vector()).collect();
                 let command: Vec<_> = points.iter().map(|p| p.command.vector()).collect();
-                let joints: Option<Vec<_>> = points.iter().map(|p| p.joints_rad).collect();
-                let again = Gp::again(&camera, &command, joints.as_deref(), choice);
+                let stances: Option<Vec<_>> = points.iter().map(|p| p.stance()).collect();
+                let again = Gp::again(&camera, &command, stances, choice);
                 Some(again.ok_or_else(|| bad("its points do not determine it".into()))?)
             }
             None => None,
@@ -537,21 +585,7 @@ impl Map {
     /// As for [`load`](Self::load), [`MapError::WrongCamera`], [`MapError::WrongArm`], [`MapError::FailedCheck`].
     pub fn load_for(path: &Path, identity: &Identity) -> Result<Self, MapError> {
         let map = Self::load(path)?;
-        let Identity { arm, camera } = map.identity();
-        if *camera != identity.camera {
-            return Err(MapError::WrongCamera {
-                path: path.into(),
-                found: camera.clone(),
-                wanted: identity.camera.clone(),
-            });
-        }
-        if *arm != identity.arm {
-            return Err(MapError::WrongArm {
-                path: path.into(),
-                found: arm.clone(),
-                wanted: identity.arm.clone(),
-            });
-        }
+        map.belongs_to(Some(&identity.arm), Some(&identity.camera), path)?;
         if let Some(check) = map.file.checked.as_ref().filter(|c| !c.passed) {
             return Err(MapError::FailedCheck {
                 path: path.into(),
@@ -562,16 +596,40 @@ impl Map {
         Ok(map)
     }
 
+    /// Makes sure that a map, which was read from `path`, is of this arm and of this camera (see [`camera_identity`]), as far as they are
+    /// given.
+    ///
+    /// # Errors
+    /// [`MapError::WrongCamera`], [`MapError::WrongArm`].
+    pub fn belongs_to(&self, arm: Option<&str>, camera: Option<&str>, path: &Path) -> Result<(), MapError> {
+        let own = self.identity();
+        if let Some(wanted) = camera.filter(|c| *c != own.camera) {
+            return Err(MapError::WrongCamera {
+                path: path.into(),
+                found: own.camera.clone(),
+                wanted: wanted.into(),
+            });
+        }
+        if let Some(wanted) = arm.filter(|a| *a != own.arm) {
+            return Err(MapError::WrongArm {
+                path: path.into(),
+                found: own.arm.clone(),
+                wanted: wanted.into(),
+            });
+        }
+        Ok(())
+    }
+
     pub(crate) fn with_layer(&self, layer: realign::Layer) -> Self {
         let mut map = self.clone();
-        (map.file.version, map.file.realigned) = (VERSION, Some(layer));
+        (map.file.version, map.file.realigned) = (map.file.version.max(VERSION_WITHOUT_FLAWS), Some(layer));
         map.file.checked = None; // of how it was before
         map
     }
 
     pub(crate) fn with_correction(&self, layer: correct::Layer) -> Self {
         let mut map = self.clone();
-        (map.file.version, map.file.correction) = (VERSION, Some(layer));
+        (map.file.version, map.file.correction) = (map.file.version.max(VERSION_WITHOUT_FLAWS), Some(layer));
         map
     }
 
@@ -590,7 +648,7 @@ impl Map {
     /// The map with what a check said of it.
     pub fn with_check(&self, check: Check) -> Self {
         let mut map = self.clone();
-        (map.file.version, map.file.checked) = (VERSION, Some(check));
+        (map.file.version, map.file.checked) = (map.file.version.max(VERSION_WITHOUT_FLAWS), Some(check));
         map
     }
 
@@ -605,9 +663,10 @@ impl Map {
             .unwrap_or_default()
     }
 
-    /// The arm's lengths and tool, where ripple was found.
+    /// The arm's lengths and tool, where the pairs had joint angles.
     pub(crate) fn arm(&self) -> Option<&Arm> {
-        Some(&self.file.gp.as_ref()?.ripple.as_ref()?.arm)
+        let choice = self.file.gp.as_ref()?;
+        choice.flawed.as_ref().or(choice.ripple.as_ref().map(|r| &r.arm))
     }
 
     /// The arm and the camera that the map is true for.
@@ -623,6 +682,13 @@ impl Map {
     /// Errors at points left out of the fit.
     pub fn held_out(&self) -> &Figures {
         &self.file.held_out
+    }
+
+    /// Noise of one measurement such as the pairs', as their likelihood tells it apart from what is smooth or ripple: standard deviation
+    /// along each axis across the viewing ray, and along it, mm. Only a `gp` map knows it.
+    pub fn noise_mm(&self) -> Option<[f64; 2]> {
+        let choice = self.file.gp.as_ref()?;
+        Some([choice.across.noise_mm, choice.along.noise_mm])
     }
 
     /// Hash of the pairs that it was fitted to (of their contract CSV).
@@ -665,30 +731,69 @@ fn hull(e: &Estimate, leverage: f64, reach: f64) -> Hull {
     }
 }
 
-fn first_joints(pair: &Pair) -> Option<[f64; 3]> {
-    pair.joints_rad.map(|[j1, j2, j3, ..]| [j1, j2, j3])
+/// How the arm stood at every visit; where each joint came from is known from the visit before, whether the marker was seen there or not.
+fn stances(pairs: &[Pair]) -> Vec<Option<Stance>> {
+    /// A joint that turned less kept its side, rad.
+    const STILL_RAD: f64 = 1e-4;
+    let mut order: Vec<usize> = (0..pairs.len()).collect();
+    order.sort_by(|&a, &b| pairs[a].t_s.total_cmp(&pairs[b].t_s));
+    let mut stances = vec![None; pairs.len()];
+    let mut before: Option<Stance> = None;
+    for i in order {
+        let now = pairs[i].joints_rad.map(|[j1, j2, j3, ..]| {
+            let joints_rad = [j1, j2, j3];
+            let came_from = before.map_or([0.0; 3], |before| {
+                std::array::from_fn(|j| match joints_rad[j] - before.joints_rad[j] {
+                    turned if turned.abs() > STILL_RAD => turned.signum(),
+                    _ => before.came_from[j],
+                })
+            });
+            Stance { joints_rad, came_from }
+        });
+        before = now.or(before);
+        stances[i] = now;
+    }
+    stances
 }
 
-/// The Gaussian process of the points that are believed, or of as many of them as it needs; what it does not believe is struck from
-/// `keep`.
-fn gaussian(pairs: &[Pair], points: &Points, keep: &mut [bool]) -> Result<gp::Fitted, FitError> {
-    let mut used: Vec<usize> = (0..keep.len()).filter(|&i| keep[i]).collect();
+/// The Gaussian process of the points that are believed, or of as many of them as it needs; `keep` says which are, before and after.
+fn gaussian(
+    model: ArmModel,
+    stances: &[Option<Stance>],
+    points: &Points,
+    keep: &mut [bool],
+) -> Result<gp::Fitted, FitError> {
+    let believed = keep.iter().filter(|&&k| k).count();
     let method = Method::Gp;
     let too_few = FitError::TooFew {
-        have: used.len(),
+        have: believed,
         need: method.fewest_pairs(),
         method: method.name(),
     };
-    if used.len() < method.fewest_pairs() {
+    if believed < method.fewest_pairs() {
         return Err(too_few);
     }
-    used = spread(used.len(), gp::MOST_POINTS)
+    // doubted points have another chance, unless there are more than enough of the others
+    let asked: Vec<usize> = (0..keep.len())
+        .filter(|&i| keep[i] || keep.len() <= gp::MOST_POINTS)
+        .collect();
+    let used: Vec<usize> = spread(asked.len(), gp::MOST_POINTS)
         .into_iter()
-        .map(|k| used[k])
+        .map(|k| asked[k])
         .collect();
     let of = |all: &[Vector3<f64>]| -> Vec<Vector3<f64>> { used.iter().map(|&i| all[i]).collect() };
-    let joints: Option<Vec<_>> = used.iter().map(|&i| first_joints(&pairs[points.index[i]])).collect();
-    let mut fitted = gp::fit(&of(&points.camera), &of(&points.command), joints.as_deref()).ok_or(too_few)?;
+    let stances: Option<Vec<_>> = used.iter().map(|&i| stances[points.index[i]]).collect();
+    let command = of(&points.command);
+    let joints: Option<Vec<_>> = stances.as_ref().map(|s| s.iter().map(|s| s.joints_rad).collect());
+    let arm = match (model, &joints) {
+        (_, None) => None,
+        (ArmModel::FromPairs, Some(joints)) => Arm::of(&command, joints),
+        (ArmModel::Gp25, Some(joints)) => {
+            Some(Arm::gp25(&command, joints).map_err(|scatter_mm| FitError::NotThisArm { scatter_mm })?)
+        }
+    };
+    let at_first = used.iter().map(|&i| keep[i]).collect();
+    let mut fitted = gp::fit(&of(&points.camera), &command, stances.as_deref(), arm, at_first).ok_or(too_few)?;
     for (&i, &kept) in used.iter().zip(&fitted.keep) {
         keep[i] = kept;
     }

@@ -6,7 +6,7 @@
 use crate::PairError;
 use geometry::{Base, Camera, Transform};
 use nalgebra::{Quaternion, UnitQuaternion};
-use serde::{Deserialize, Serialize};
+use serde::Deserialize;
 use std::path::Path;
 
 /// A fixed camera's pose in a robot's base, as easy_handeye keeps it (`eye_on_base`).
@@ -34,8 +34,16 @@ pub struct HandEye {
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum PoseError {
     /// Not the YAML of a hand-eye calibration.
-    #[error("no hand-eye calibration as easy_handeye writes it: {0}")]
+    #[error(
+        "neither a hand-eye calibration as easy_handeye writes it (parameters, transformation) nor a ROS transform (header, transform): {0}"
+    )]
     Syntax(String),
+    /// Several transforms, or none.
+    #[error("{found} transforms in one file: leave only that from the robot's base to the camera")]
+    Several {
+        /// How many.
+        found: usize,
+    },
     /// A camera on the robot's hand.
     #[error(
         "the camera of this pose is on the robot's hand (eye_on_hand); a cell has it fixed: calibrate with eye_on_base"
@@ -57,14 +65,56 @@ pub enum PoseError {
     },
 }
 
-#[derive(Serialize, Deserialize)]
+/// Easy_handeye's file, a ROS transform or a message of some: whichever keys are there.
+#[derive(Deserialize)]
 struct File {
-    parameters: Parameters,
-    transformation: Transformation,
+    parameters: Option<Parameters>,
+    transformation: Option<Transformation>,
+    header: Option<Header>,
+    #[serde(default)]
+    child_frame_id: String,
+    transform: Option<RosTransform>,
+    transforms: Option<Vec<Stamped>>,
+}
+
+/// ROS's `geometry_msgs/TransformStamped`.
+#[derive(Deserialize)]
+struct Stamped {
+    header: Header,
+    #[serde(default)]
+    child_frame_id: String,
+    transform: RosTransform,
+}
+
+#[derive(Deserialize)]
+struct Header {
+    #[serde(default)]
+    frame_id: String,
+}
+
+#[derive(Deserialize)]
+struct RosTransform {
+    translation: Xyz,
+    rotation: Xyzw,
+}
+
+#[derive(Deserialize)]
+struct Xyz {
+    x: f64,
+    y: f64,
+    z: f64,
+}
+
+#[derive(Deserialize)]
+struct Xyzw {
+    x: f64,
+    y: f64,
+    z: f64,
+    w: f64,
 }
 
 /// Keys that are not needed are passed over.
-#[derive(Serialize, Deserialize)]
+#[derive(Deserialize)]
 struct Parameters {
     #[serde(default)]
     eye_on_hand: bool,
@@ -74,7 +124,7 @@ struct Parameters {
     tracking_base_frame: String,
 }
 
-#[derive(Serialize, Deserialize)]
+#[derive(Deserialize)]
 struct Transformation {
     x: f64,
     y: f64,
@@ -85,20 +135,67 @@ struct Transformation {
     qw: f64,
 }
 
+impl From<RosTransform> for Transformation {
+    fn from(
+        RosTransform {
+            translation: t,
+            rotation: q,
+        }: RosTransform,
+    ) -> Self {
+        Self {
+            x: t.x,
+            y: t.y,
+            z: t.z,
+            qx: q.x,
+            qy: q.y,
+            qz: q.z,
+            qw: q.w,
+        }
+    }
+}
+
 /// Farther than any arm reaches, m.
 const FAR_M: f64 = 50.0;
 
 impl HandEye {
-    /// From the text of easy_handeye's file.
+    /// From the text of easy_handeye's file, or of a ROS transform from the robot's base (its parent frame) to the camera.
     ///
     /// # Errors
     /// [`PoseError`].
     pub fn from_yaml(text: &str) -> Result<Self, PoseError> {
+        // `ros2 topic echo` ends every message with a line of three dashes
+        let text = text.trim_end().trim_end_matches("---");
         let file: File = serde_saphyr::from_str(text).map_err(|e| PoseError::Syntax(e.to_string()))?;
-        if file.parameters.eye_on_hand {
-            return Err(PoseError::EyeOnHand);
-        }
-        let t = file.transformation;
+        let (base_frame, camera_frame, t) = match file {
+            File {
+                parameters: Some(p),
+                transformation: Some(t),
+                ..
+            } => {
+                if p.eye_on_hand {
+                    return Err(PoseError::EyeOnHand);
+                }
+                (p.robot_base_frame, p.tracking_base_frame, t)
+            }
+            File {
+                header: Some(header),
+                child_frame_id,
+                transform: Some(transform),
+                ..
+            } => (header.frame_id, child_frame_id, transform.into()),
+            File {
+                transforms: Some(mut all),
+                ..
+            } => match (all.pop(), all.len()) {
+                (Some(only), 0) => (only.header.frame_id, only.child_frame_id, only.transform.into()),
+                (last, more) => {
+                    return Err(PoseError::Several {
+                        found: more + usize::from(last.is_some()),
+                    });
+                }
+            },
+            _ => return Err(PoseError::Syntax("it has the keys of neither".into())),
+        };
         let quaternion = Quaternion::new(t.qw, t.qx, t.qy, t.qz);
         let length = quaternion.norm();
         if length.is_nan() || (length - 1.0).abs() > 1e-2 {
@@ -109,8 +206,8 @@ impl HandEye {
             return Err(PoseError::Millimetres { metres });
         }
         Ok(Self {
-            base_frame: file.parameters.robot_base_frame,
-            camera_frame: file.parameters.tracking_base_frame,
+            base_frame,
+            camera_frame,
             base_from_camera: Transform::from_parts(
                 [t.x, t.y, t.z].map(|m| 1000.0 * m),
                 UnitQuaternion::from_quaternion(quaternion),
@@ -147,7 +244,7 @@ impl HandEye {
         [t.x, t.y, t.z, q.x, q.y, q.z, q.w]
     }
 
-    /// Reads easy_handeye's file.
+    /// Reads easy_handeye's file or a ROS transform, as [`from_yaml`](Self::from_yaml).
     ///
     /// # Errors
     /// [`PairError::Read`], [`PairError::Pose`].
@@ -171,6 +268,26 @@ fn quoted(name: &str) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn ros_transforms_are_read() {
+        let one = "header:\n  stamp: {sec: 1, nanosec: 2}\n  frame_id: base_link\nchild_frame_id: camera\ntransform:\n  \
+                   translation: {x: 1.0, y: 0.5, z: 2.0}\n  rotation: {x: 1.0, y: 0.0, z: 0.0, w: 0.0}\n";
+        let pose = HandEye::from_yaml(one).expect("a transform");
+        assert_eq!(
+            (pose.base_frame.as_str(), pose.camera_frame.as_str()),
+            ("base_link", "camera")
+        );
+        assert_eq!(
+            pose.base_from_camera.isometry().translation.vector.as_slice(),
+            [1000.0, 500.0, 2000.0]
+        );
+        let listed: String = one.lines().map(|line| format!("  {line}\n")).collect();
+        let listed = listed.replacen("  header", "- header", 1);
+        assert_eq!(HandEye::from_yaml(&format!("transforms:\n{listed}---\n")), Ok(pose));
+        let two = HandEye::from_yaml(&format!("transforms:\n{listed}{listed}"));
+        assert_eq!(two, Err(PoseError::Several { found: 2 }));
+    }
 
     #[test]
     fn what_is_no_fixed_camera_is_refused() {

@@ -67,6 +67,14 @@ pub enum FitError {
         /// Median residual with one axis turned round, mm.
         mirrored_mm: f64,
     },
+    /// Joint angles of another arm than was said.
+    #[error(
+        "the joint angles are not those of a GP25 whose tool keeps its direction: they put the wrist {scatter_mm:.1} mm (rms) off the commands; are q1_rad to q6_rad radians, J1 first? For another arm leave `--arm gp25` out"
+    )]
+    NotThisArm {
+        /// Scatter of the vector from wrist to marker, mm.
+        scatter_mm: f64,
+    },
     /// No motion explains the pairs.
     #[error(
         "no rigid motion explains the pairs: half of them are off by more than {median_mm:.1} mm; are the rows shifted against each other, columns swapped, or two cameras mixed?"
@@ -112,7 +120,7 @@ pub(crate) fn usable(pairs: &[Pair], need: usize, method: &'static str) -> Resul
         return Err(FitError::TooFew { have, need, method });
     }
     check_units(pairs, &points)?;
-    check_columns(pairs)?;
+    check_columns(pairs, &points)?;
     Ok(points)
 }
 
@@ -146,7 +154,7 @@ fn check_units(pairs: &[Pair], points: &Points) -> Result<(), FitError> {
 }
 
 /// `depth_mm` is `cam_z_mm` under another name, and `u_px` grows with `cam_x_mm`: enough to notice exchanged columns.
-fn check_columns(pairs: &[Pair]) -> Result<(), FitError> {
+fn check_columns(pairs: &[Pair], points: &Points) -> Result<(), FitError> {
     let valid = || pairs.iter().filter(|p| p.valid);
     // depth_mm, then the columns that it could stand beside
     let rows: Vec<[f64; 7]> = valid()
@@ -181,9 +189,14 @@ fn check_columns(pairs: &[Pair]) -> Result<(), FitError> {
     if rays.len() >= 8 {
         let c = |a: usize, b: usize| correlation(rays.iter().map(|r| (r[a], r[b])));
         if c(0, 3) > 0.9 && c(1, 2) > 0.9 && c(0, 2) < 0.5 && c(1, 3) < 0.5 {
+            // exchanged coordinates mirror the frame, exchanged pixels do not
+            let (first, second) = match robust_rigid(points) {
+                Err(FitError::Mirrored { .. }) => ("cam_x_mm", "cam_y_mm"),
+                _ => ("u_px", "v_px"),
+            };
             return Err(FitError::Swapped {
-                first: "u_px",
-                second: "v_px",
+                first,
+                second,
                 reason: "u grows with cam_y and v with cam_x",
             });
         }

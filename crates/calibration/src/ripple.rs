@@ -8,14 +8,10 @@ use crate::arm::Arm;
 use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 
-/// Standard deviation of a wave's cosine and sine before anything is measured, rad.
-pub(crate) const PRIOR_RAD: f64 = 3e-4;
+/// Standard deviation of a wave's cosine and sine before anything is measured, rad: a tenth of a millimetre at the tool.
+pub(crate) const PRIOR_RAD: f64 = 1e-4;
 /// Waves that may be kept.
 pub(crate) const MOST_WAVES: usize = 8;
-/// Twice the log likelihood that a wave has to gain.
-pub(crate) const LEAST_GAIN: f64 = 5.0;
-/// Share of the square of the left-out errors that may be left with it.
-pub(crate) const LESS: f64 = 0.99;
 /// Waves of one joint are at least so many cycles a turn apart.
 pub(crate) const APART: f64 = 2.0;
 
@@ -77,15 +73,14 @@ pub(crate) fn candidates() -> impl Iterator<Item = Wave> {
 }
 
 /// The best wave near one, with what it gains.
-pub(crate) fn refined(from: (f64, Wave), gain: &impl Fn(Wave) -> f64) -> (f64, Wave) {
+pub(crate) fn refined(from: (f64, Wave), gains: &impl Fn(&[Wave]) -> Vec<f64>) -> (f64, Wave) {
     let mut best = from;
     for step in [0.25, 0.125, 0.06] {
-        for cycles in [best.1.cycles - step, best.1.cycles + step] {
-            let wave = Wave {
-                joint: best.1.joint,
-                cycles,
-            };
-            let gained = gain(wave);
+        let beside = [-step, step].map(|by| Wave {
+            cycles: best.1.cycles + by,
+            ..best.1
+        });
+        for (gained, wave) in gains(&beside).into_iter().zip(beside) {
             if gained > best.0 {
                 best = (gained, wave);
             }

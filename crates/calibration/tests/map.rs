@@ -337,8 +337,8 @@ fn a_map_survives_its_file_and_knows_its_cell() {
         Map::load(&path).expect_err("must be refused")
     };
     assert!(matches!(
-        refused(&text.replacen("\"version\":2", "\"version\":4", 1)),
-        MapError::Version { found: 4, .. }
+        refused(&text.replacen("\"version\":2", "\"version\":5", 1)),
+        MapError::Version { found: 5, .. }
     ));
     assert!(matches!(refused(&text[..text.len() / 2]), MapError::Format { .. }));
     assert!(matches!(
@@ -405,6 +405,11 @@ fn what_cannot_be_meant_is_refused_in_words() {
     );
     let swapped = error(&|p| p.pixel = p.pixel.map(|px| Pixel::new(px.v_px, px.u_px)));
     assert!(matches!(swapped, FitError::Swapped { first: "u_px", .. }), "{swapped}");
+    let swapped = error(&|p| camera(p, &|[x, y, z]| [y, x, z]));
+    assert!(
+        matches!(swapped, FitError::Swapped { first: "cam_x_mm", .. }),
+        "{swapped}"
+    );
     let mirrored = error(&|p| p.command = Point::new(p.command.y_mm(), p.command.x_mm(), p.command.z_mm()));
     assert!(matches!(mirrored, FitError::Mirrored { .. }), "{mirrored}");
     let flat = error(&|p| p.valid = p.node.is_some_and(|n| n[0] == 1));

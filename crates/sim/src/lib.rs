@@ -36,7 +36,6 @@ pub use score::{Action, ActionKind, Aim, Score, ScrewScore, UnitScore};
 pub use world::unit_seed;
 
 use cell::device::{Arm, Devices};
-use geometry::{Camera, Point, Tool};
 use scene::FaceTruth;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
@@ -254,14 +253,6 @@ impl SimulatedCell {
         let mut truth = (*world.truth()?).clone();
         truth.screws.retain(|screw| !world.is_out(screw.id));
         Some(truth)
-    }
-
-    /// Where the bit's tip, or the middle of the marker on the jig, of an arm really is; `None` if there is no such arm. For reports and
-    /// evaluation, never for deciding.
-    pub fn tool_truth(&self, arm: usize) -> Option<Point<Camera>> {
-        let world = lock(&self.world);
-        let at = world.arms.get(arm)?.camera_from_true_tool(world.now_s());
-        Some(at * Point::<Tool>::new(0.0, 0.0, 0.0))
     }
 
     /// What the plant was told: one JSON text a finished unit.

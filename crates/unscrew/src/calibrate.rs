@@ -3,12 +3,15 @@
 use crate::{Ended, capture_page::Shown, diagnosis, output};
 use anyhow::{Result, bail};
 use calibration::{
-    Between, Check, HandEye, Identity, Map, Method, Moved, PlanError, Settings, Target, Volume, diagnose, lattice,
-    read_marks, read_pairs, read_queries, rigid_figures, scattered, verify,
+    ArmModel, Between, Check, HandEye, Identity, Map, Method, Moved, PlanError, Settings, Target, Volume,
+    camera_identity, diagnose, lattice, read_marks, read_pairs, read_queries, rigid_figures, scattered, verify,
 };
-use geometry::{Base, Point};
+use cell::CellConfig;
+use cell::motion::{ArmMotion, CellDrawing, DrawnUnit, Gp25};
+use geometry::{Base, Point, read_camera_info};
 use serde::Serialize;
-use std::path::PathBuf;
+use sim::layout;
+use std::path::{Path, PathBuf};
 
 /// From marker positions to a map from camera to robot.
 #[derive(clap::Subcommand)]
@@ -72,13 +75,45 @@ impl Visits {
     }
 }
 
+/// Whose map it has to be.
+#[derive(clap::Args)]
+pub struct Whose {
+    /// Refuse a map that was fitted for another arm
+    #[arg(long)]
+    arm: Option<String>,
+    /// Refuse a map that was fitted for another camera (ROS camera_info YAML)
+    #[arg(long, value_name = "FILE")]
+    camera: Option<PathBuf>,
+}
+
+impl Whose {
+    /// Reads a map if it is the right one.
+    fn load(&self, path: &Path) -> Result<Map> {
+        let map = Map::load(path)?;
+        let camera = self.camera.as_deref().map(identity_of).transpose()?;
+        map.belongs_to(self.arm.as_deref(), camera.as_deref(), path)?;
+        Ok(map)
+    }
+}
+
+fn identity_of(camera_info: &Path) -> Result<String> {
+    Ok(camera_identity(&read_camera_info(camera_info)?))
+}
+
 #[derive(clap::Args)]
 pub struct Plan {
     #[command(flatten)]
     visits: Visits,
     /// Opposite corners of the volume in the robot's base, mm: x,y,z,x,y,z
-    #[arg(long, value_delimiter = ',', num_args = 6, allow_hyphen_values = true, default_values_t = [950.0, -450.0, 150.0, 1350.0, 450.0, 900.0])]
-    volume_mm: Vec<f64>,
+    #[arg(long, value_name = "CORNERS", allow_hyphen_values = true, default_value = "950,-450,150,1350,450,900", value_parser = volume)]
+    volume_mm: Volume,
+    /// Cell file whose drawing (`[motion]`) the arm has to stay clear of, on an empty table; without it only reach, joint limits and the
+    /// wrist singularity of a GP25 are looked at
+    #[arg(long, value_name = "FILE")]
+    cell: Option<PathBuf>,
+    /// The arm in that drawing
+    #[arg(long, default_value = "arm_a", requires = "cell")]
+    arm: String,
     /// As JSON
     #[arg(long)]
     json: bool,
@@ -114,9 +149,13 @@ pub struct Fit {
     /// With --method lattice exactly as published: no rejection, no fallback
     #[arg(long)]
     as_published: bool,
-    /// Arm that the map belongs to
+    /// Arm that the map belongs to. gp25: joint angles at a query come from the kinematics of a GP25, and pairs of another arm are refused;
+    /// with any other name they do where the pairs' own angles are those of a GP25, and come from a regression on these where not
     #[arg(long, default_value = "")]
     arm: String,
+    /// Camera that the pairs come from (ROS camera_info YAML): the map is then refused for another
+    #[arg(long, value_name = "FILE")]
+    camera: Option<PathBuf>,
     /// As JSON
     #[arg(long)]
     json: bool,
@@ -147,6 +186,8 @@ pub struct Apply {
     map: PathBuf,
     /// Observations: CSV with the columns of pairs, without cmd_* and q*
     queries: PathBuf,
+    #[command(flatten)]
+    whose: Whose,
     /// One JSON object a row
     #[arg(long)]
     json: bool,
@@ -168,6 +209,8 @@ pub struct Verify {
     /// Passes if 95 % of the 3D errors are at most this, mm
     #[arg(long, default_value_t = 0.35)]
     limit_mm: f64,
+    #[command(flatten)]
+    whose: Whose,
     /// As JSON
     #[arg(long)]
     json: bool,
@@ -213,6 +256,8 @@ pub struct Realign {
     /// Good enough if 95 % of the errors that are left are at most this, mm
     #[arg(long, default_value_t = 0.35)]
     limit_mm: f64,
+    #[command(flatten)]
+    whose: Whose,
     /// As JSON
     #[arg(long)]
     json: bool,
@@ -234,6 +279,21 @@ pub struct Correct {
     /// How far from a target its mark still says something, mm
     #[arg(long, default_value_t = 120.0)]
     reach_mm: f64,
+}
+
+fn volume(corners: &str) -> Result<Volume, String> {
+    let numbers: Result<Vec<f64>, _> = corners
+        .split([',', ' '])
+        .filter(|n| !n.is_empty())
+        .map(str::parse)
+        .collect();
+    match numbers.as_deref() {
+        Ok([a, b, c, d, e, f]) => Ok(Volume::between(
+            Point::<Base>::new(*a, *b, *c),
+            Point::<Base>::new(*d, *e, *f),
+        )),
+        _ => Err("six numbers are needed, x,y,z of two opposite corners".into()),
+    }
 }
 
 fn moved(name: &str) -> Result<Moved, String> {
@@ -273,9 +333,8 @@ pub fn run(command: &Command) -> Result<Ended> {
 }
 
 fn plan(args: &Plan) -> Result<Ended> {
-    let v = &args.volume_mm;
-    let corner = |k: usize| Point::<Base>::new(v[k], v[k + 1], v[k + 2]);
-    let targets = args.visits.over(&Volume::between(corner(0), corner(3)))?;
+    let targets = args.visits.over(&args.volume_mm)?;
+    let targets = reachable(targets, args.cell.as_deref(), &args.arm)?;
     if args.json {
         println!(
             "{}",
@@ -298,6 +357,80 @@ fn plan(args: &Plan) -> Result<Ended> {
     Ok(Ended::Good)
 }
 
+/// How far before a place the arm begins its straight way into it, and how fast it goes there, mm and mm/s.
+const STANDOFF_MM: f64 = 40.0;
+const APPROACH_MM_S: f64 = 100.0;
+/// What is kept between the arm and the cell, mm.
+const MARGIN_MM: f64 = 5.0;
+
+/// The places that the arm reaches with the tool along the camera's view, clear of the wrist singularity and, where a cell is given, of what
+/// it has drawn; the others are said and left out.
+fn reachable(targets: Vec<Target>, cell: Option<&Path>, arm: &str) -> Result<Vec<Target>> {
+    let motion = cell.map(|path| in_cell(path, arm)).transpose()?;
+    let gp25 = Gp25::new(layout::flange_from_tool());
+    let why_not = |command: Point<Base>| -> Option<String> {
+        let contact = layout::tool_at(command);
+        // the tool looks along x
+        let [x, y, z] = command.to_array();
+        let before = layout::tool_at(Point::new(x - STANDOFF_MM, y, z));
+        match &motion {
+            Some(motion) => {
+                let way = motion.check(motion.home_rad(), before, contact, APPROACH_MM_S);
+                way.err().map(|refusal| refusal.to_string())
+            }
+            None => {
+                let poses = [before, contact];
+                poses
+                    .into_iter()
+                    .find_map(|pose| gp25.inverse(pose).err())
+                    .map(|e| e.to_string())
+            }
+        }
+    };
+    let planned = targets.len();
+    let (mut left, mut reason) = (Vec::with_capacity(planned), None);
+    let bar = output::progress(planned as u64, "places checked");
+    for target in targets {
+        match why_not(target.command) {
+            None => left.push(Target {
+                id: left.len() as u64,
+                ..target
+            }),
+            Some(why) => reason = Some(why),
+        }
+        bar.inc(1);
+    }
+    bar.finish_and_clear();
+    let Some(reason) = reason else { return Ok(left) };
+    let out = planned - left.len();
+    if 2 * out > planned {
+        bail!(
+            "{out} of {planned} places cannot be visited ({reason}): move the volume (--volume-mm) nearer to the arm"
+        );
+    }
+    eprintln!("unscrew: {out} of {planned} places are left out, such as one where {reason}");
+    Ok(left)
+}
+
+/// An arm of a cell as drawn. A calibration is on an empty table, with one arm at a time at its own pace.
+fn in_cell(path: &Path, arm: &str) -> Result<ArmMotion> {
+    let drawn = CellConfig::read(path)?.motion;
+    let names: Vec<String> = drawn.arms.iter().map(|a| a.name.clone()).collect();
+    let empty = CellDrawing {
+        margin_mm: MARGIN_MM,
+        unit: DrawnUnit {
+            face_mm: [1.0; 2],
+            depth_mm: 1.0,
+            ..drawn.unit
+        },
+        ..drawn
+    };
+    match ArmMotion::new(&empty, arm) {
+        Some(motion) => Ok(motion),
+        None => bail!("{} draws no arm '{arm}'; it has {}", path.display(), names.join(", ")),
+    }
+}
+
 fn capture(args: &Capture) -> Result<Ended> {
     let done = crate::run::capture_pairs(args.cell_seed, &args.arm, &args.visits, &args.out, &args.shown)?;
     println!(
@@ -318,9 +451,14 @@ fn fit(args: &Fit) -> Result<Ended> {
     let settings = Settings {
         method: args.method,
         as_published: args.as_published,
+        arm_model: if args.arm.eq_ignore_ascii_case("gp25") {
+            ArmModel::Gp25
+        } else {
+            ArmModel::FromPairs
+        },
         identity: Identity {
             arm: args.arm.clone(),
-            camera: String::new(),
+            camera: args.camera.as_deref().map(identity_of).transpose()?.unwrap_or_default(),
         },
         date: output::now_utc(),
     };
@@ -386,7 +524,7 @@ struct AppliedRow {
 }
 
 fn apply(args: &Apply) -> Result<Ended> {
-    let map = Map::load(&args.map)?;
+    let map = args.whose.load(&args.map)?;
     let queries = read_queries(&args.queries)?;
     if !args.json {
         println!("id,base_x_mm,base_y_mm,base_z_mm,sigma_lateral_mm,sigma_depth_mm,hull");
@@ -443,7 +581,7 @@ fn check(args: &Verify) -> Result<Ended> {
         let good = figures.n > 0 && figures.total.p95_mm <= args.limit_mm;
         return Ok(if good { Ended::Good } else { Ended::NotGoodEnough });
     };
-    let map = Map::load(path)?;
+    let map = args.whose.load(path)?;
     let verification = verify(&map, &pairs, args.limit_mm);
     if args.record {
         let check = Check {
@@ -479,7 +617,7 @@ fn export(args: &Export) -> Result<Ended> {
 }
 
 fn realign(args: &Realign) -> Result<Ended> {
-    let map = Map::load(&args.map)?;
+    let map = args.whose.load(&args.map)?;
     let pairs = read_pairs(&args.pairs)?;
     let moved = args.moved.unwrap_or_else(|| Moved::for_pairs(&pairs));
     let (realigned, told) = map.realign(&pairs, moved, &output::now_utc())?;

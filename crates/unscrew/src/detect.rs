@@ -3,7 +3,7 @@
 use crate::annotations::{self, Fastener, Format};
 use crate::{Ended, model::ModelArgs, output};
 use anyhow::{Context, Result, bail};
-use calibration::Map;
+use calibration::{Map, camera_identity};
 use geometry::{RgbdFrame, read_camera_info, read_rgbd};
 use std::{
     io::Write,
@@ -102,10 +102,14 @@ pub fn run(args: &Args) -> Result<Ended> {
         bail!("--map needs --depth and --camera: without them there is no point in space to map");
     }
     let detector = args.model.detector()?;
-    if let Some(path) = &args.camera {
-        read_camera_info(path)?; // a bad camera file is said before any picture is worked on
-    }
+    // a bad camera file is said before any picture is worked on
+    let camera = args.camera.as_deref().map(read_camera_info).transpose()?;
     let map = args.map.as_deref().map(Map::load).transpose()?;
+    if let (Some(map), Some(path), Some(camera)) = (&map, &args.map, &camera)
+        && !map.identity().camera.is_empty()
+    {
+        map.belongs_to(None, Some(&camera_identity(camera)), path)?;
+    }
     for folder in args.overlay.iter().chain(&args.boxes) {
         output::prepare_folder(folder)?;
     }
