@@ -38,7 +38,7 @@ pub struct Digest {
     pub claims: Vec<Claim>,
 }
 
-/// An intent of the journal, with the time until its next event: when a physical action may have happened, and whether the journal says
+/// An intent of the journal, with the time until the event that answers it: when a physical action may have happened, and whether the journal says
 /// that one did.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Claim {
@@ -46,11 +46,14 @@ pub struct Claim {
     pub face: Option<FaceId>,
     /// Where the bit was sent; `None` for a pull.
     pub aim: Option<Point<Base>>,
+    /// Arm that was sent there; `None` for a pull, and in journals of before arms worked at the same time.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub arm: Option<String>,
     /// What was pulled at; `None` for a burst.
     pub cover: Option<String>,
     /// Time of the intent, cell clock, s.
     pub from_s: f64,
-    /// Time of the event after it; `None`: it is the last one.
+    /// Time of the event that answers it or shows that none will; `None`: there is none yet.
     pub until_s: Option<f64>,
     /// True if the journal says how it ended.
     pub done: bool,
@@ -93,39 +96,62 @@ impl Digest {
     }
 }
 
-/// The intents to act on a unit, with their ends.
+/// The intents to act on a unit, with their ends. Two arms may drive at the same time, each answers for itself.
 fn claims(events: &[(f64, Event)]) -> Vec<Claim> {
-    let (mut claims, mut face, mut open) = (Vec::<Claim>::new(), None, false);
+    let (mut claims, mut face) = (Vec::<Claim>::new(), None);
+    // numbers of the claims that are open, with their screw
+    let mut open: Vec<(usize, Option<usize>)> = Vec::new();
     for (t_s, event) in events {
-        if let (true, Some(claim)) = (open, claims.last_mut()) {
-            claim.until_s = Some(*t_s);
-            claim.done = match event {
-                Event::Driven { burst, .. } => burst.end.is_some(),
-                Event::Pulled { .. } => true,
-                _ => false,
-            };
-        }
-        open = false;
         match event {
-            Event::Presented { face: now } => face = Some(now.clone()),
-            Event::Intent { act } => {
-                let (aim, cover) = match act {
-                    Act::Drive { aim, .. } => (Some(*aim), None),
-                    Act::Pull { cover } => (None, Some(cover.clone())),
-                    _ => continue,
+            Event::Driven { found, arm, burst } => {
+                let is_it = |(k, screw): &(usize, Option<usize>)| {
+                    *screw == Some(*found) && claims[*k].arm.as_ref() == Some(arm)
                 };
-                open = true;
-                claims.push(Claim {
-                    face: face.clone(),
-                    aim,
-                    cover,
-                    from_s: *t_s,
-                    until_s: None,
-                    done: false,
-                });
+                if let Some(at) = open.iter().position(is_it) {
+                    end(&mut claims[open.remove(at).0], *t_s, burst.end.is_some());
+                }
             }
-            _ => {}
+            Event::Intent {
+                act: Act::Drive { .. }, ..
+            }
+            | Event::Recovery { .. }
+            | Event::LaidAside
+            | Event::State { .. } => {}
+            other => {
+                for (k, _) in open.drain(..) {
+                    let is_pull = claims[k].cover.is_some();
+                    end(&mut claims[k], *t_s, is_pull && matches!(other, Event::Pulled { .. }));
+                }
+            }
         }
+        let (aim, arm, cover, screw) = match event {
+            Event::Presented { face: now } => {
+                face = Some(now.clone());
+                continue;
+            }
+            Event::Intent {
+                act: Act::Drive { aim, arm, found, .. },
+            } => (Some(*aim), Some(arm.clone()), None, Some(*found)),
+            Event::Intent {
+                act: Act::Pull { cover },
+            } => (None, None, Some(cover.clone()), None),
+            _ => continue,
+        };
+        open.push((claims.len(), screw));
+        claims.push(Claim {
+            face: face.clone(),
+            aim,
+            arm,
+            cover,
+            from_s: *t_s,
+            until_s: None,
+            done: false,
+        });
     }
     claims
+}
+
+fn end(claim: &mut Claim, t_s: f64, done: bool) {
+    claim.until_s = Some(t_s);
+    claim.done = done;
 }

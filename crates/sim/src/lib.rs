@@ -26,6 +26,8 @@ mod mechanics;
 mod operator;
 mod score;
 #[cfg(test)]
+mod shift;
+#[cfg(test)]
 mod tests;
 mod world;
 
@@ -262,6 +264,12 @@ impl SimulatedCell {
         let world = lock(&self.world);
         let at = world.arms.get(arm)?.camera_from_true_tool(world.now_s());
         Some(at * Point::<Tool>::new(0.0, 0.0, 0.0))
+    }
+
+    /// Nearest that the arms have come to each other so far, mm; not finite while none has moved. For reports and evaluation, never for
+    /// deciding: arms that touch stop with an alarm, as real ones do.
+    pub fn nearest_arms_mm(&self) -> f64 {
+        lock(&self.world).nearest_arms_mm()
     }
 
     /// What the plant was told: one JSON text a finished unit.

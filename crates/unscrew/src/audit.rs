@@ -61,14 +61,15 @@ fn compare(claims: &[Claim], world: &[&Action], total: &mut Actions) {
         })
         .collect();
     for action in world {
-        let (pull, effect) = match &action.kind {
-            ActionKind::Drive { end, .. } => (false, *end == DriveEnd::Removed),
-            ActionKind::Pull { off, .. } => (true, *off),
+        let (pull, by, effect) = match &action.kind {
+            ActionKind::Drive { arm, end, .. } => (false, Some(arm), *end == DriveEnd::Removed),
+            ActionKind::Pull { off, .. } => (true, None, *off),
             _ => continue,
         };
         total.actions_total += 1;
         let within = |s: &&mut Slot<'_>| {
             s.claim.cover.is_some() == pull
+                && (s.claim.arm.is_none() || s.claim.arm.as_ref() == by)
                 && s.claim.from_s <= action.t_s + ROUNDING_S
                 && s.claim.until_s.is_none_or(|until_s| action.t_s <= until_s + ROUNDING_S)
         };

@@ -89,11 +89,15 @@ impl Default for CellDrawing {
             to_mm,
             radius_mm,
         };
-        let arm = |name: &str, foot_mm| DrawnArm {
+        let arm = |name: &str, foot_mm, aside_rad| DrawnArm {
             name: name.into(),
             foot_mm,
             turn_rad: 0.0,
-            home_rad: HOME_RAD,
+            home_rad: {
+                let mut home_rad = HOME_RAD;
+                home_rad[0] = aside_rad;
+                home_rad
+            },
             tip_mm: [0.0, -40.0, 300.0],
             tool: vec![
                 capsule("bit", [0.0, 0.0, -80.0], [0.0, 0.0, -6.0], 6.0),
@@ -113,7 +117,8 @@ impl Default for CellDrawing {
                 face_mm: [900.0, 750.0],
                 depth_mm: 900.0,
             },
-            arms: vec![arm("arm_a", [0.0; 3]), arm("arm_b", [0.0, 700.0, 0.0])],
+            // each a little to its own side, so that the other one has room
+            arms: vec![arm("arm_a", [0.0; 3], -0.43), arm("arm_b", [0.0, 700.0, 0.0], 0.43)],
             obstacles: vec![
                 block("floor", [800.0, 350.0, -50.0], [5000.0, 4000.0, 100.0]),
                 block("table", [1500.0, 0.0, 45.0], [1000.0, 1000.0, 90.0]),
