@@ -1,6 +1,7 @@
 //! What counting needs of a finished unit, so that a shift of thousands of units is counted in seconds: written down in the transaction
 //! that closes the unit, from its events and nothing else, and sealed as they are.
 
+use crate::device::DriveEnd;
 use crate::program::FaceId;
 use crate::record::{Act, Assist, Event, LeftAlone, Method, Outcome, Purpose, ScrewAttempt, Times, UnitRecord};
 use geometry::{Base, Point};
@@ -30,6 +31,18 @@ pub struct Digest {
     pub removed: usize,
     /// Of these, with more than one burst.
     pub retried: usize,
+    /// Of the screws that there were: out at the first burst.
+    #[serde(default)]
+    pub out_at_once: usize,
+    /// Out after more than that.
+    #[serde(default)]
+    pub out_later: usize,
+    /// Still in when all was tried.
+    #[serde(default)]
+    pub stayed: usize,
+    /// Out that were only looked for because a cover did not come off.
+    #[serde(default)]
+    pub found_later: usize,
     /// Scores of the finds that were acted on.
     pub scores_acted_on: Vec<f64>,
     /// Scores of the finds that were left alone in doubt.
@@ -71,6 +84,10 @@ impl Digest {
             let of = found().filter(|f| f.left_alone == left);
             of.map(|f| f.score).collect()
         };
+        let first = |a: &&&ScrewAttempt| a.bursts.first().and_then(|b| b.end) == Some(DriveEnd::Removed);
+        let removed = attempts.iter().filter(|a| a.removed()).count();
+        let out_at_once = attempts.iter().filter(|a| a.removed()).filter(first).count();
+        let missed = record.faces.iter().filter(|f| f.purpose == Purpose::Missed);
         Self {
             unit: record.unit,
             outcome: record.outcome.clone(),
@@ -79,7 +96,11 @@ impl Digest {
             method: record.method,
             times: record.times,
             attempted: attempts.len(),
-            removed: attempts.iter().filter(|a| a.removed()).count(),
+            removed,
+            out_at_once,
+            out_later: removed - out_at_once,
+            stayed: attempts.iter().filter(|a| !a.removed() && !a.absent()).count(),
+            found_later: missed.map(|f| f.removed()).sum(),
             retried: attempts.iter().filter(|a| a.retries() > 0).count(),
             scores_acted_on: scores(None),
             scores_in_doubt: scores(Some(LeftAlone::Review)),

@@ -198,9 +198,12 @@ impl Room {
         let begin = way.joint.first().map(|leg| leg.trajectory.begin_rad());
         let ends = way.joint.iter().map(|leg| leg.trajectory.end_rad());
         let at: Vec<[f64; 6]> = begin.into_iter().chain(ends).collect();
-        let is = |planned: &Vec<[f64; 6]>| planned.len() == at.len() && planned.iter().zip(&at).all(|(a, b)| near(a, b));
+        let is =
+            |planned: &Vec<[f64; 6]>| planned.len() == at.len() && planned.iter().zip(&at).all(|(a, b)| near(a, b));
         let there = self.from_rest_rad.last();
-        is(&self.from_rest_rad) || is(&self.from_last_rad) || at.iter().all(|q| there.is_some_and(|there| near(q, there)))
+        is(&self.from_rest_rad)
+            || is(&self.from_last_rad)
+            || at.iter().all(|q| there.is_some_and(|there| near(q, there)))
     }
 }
 

@@ -154,7 +154,9 @@ impl Mover<'_> {
         };
         let way = way.map_err(|why| refused(why.to_string()))?;
         if !planned(&way) {
-            return Err(refused("the way there is not the one that leaves the other arm its room".into()));
+            return Err(refused(
+                "the way there is not the one that leaves the other arm its room".into(),
+            ));
         }
         Ok(way.joint.iter().map(|leg| leg.to).collect())
     }

@@ -601,9 +601,9 @@ impl Way<'_> {
         let laying = self.laying.map(|(arm, _)| arm);
         let arms = (0..self.runner.devices.arms.len()).filter(|arm| laying != Some(*arm));
         // each turns back from its own side: who is away from its rest got there in a room of its own, or alone
-        let moves = arms.filter_map(|arm| self.mover(arm)).map(|mover| -> Pin<Box<dyn Future<Output = _> + '_>> {
-            Box::pin(async move { mover.home().await })
-        });
+        let moves = arms
+            .filter_map(|arm| self.mover(arm))
+            .map(|mover| -> Pin<Box<dyn Future<Output = _> + '_>> { Box::pin(async move { mover.home().await }) });
         for ended in face::all(moves.collect()).await {
             ended?;
         }
@@ -1078,7 +1078,9 @@ impl Way<'_> {
             }
         }
         self.home().await?;
-        self.lay_aside().await?;
+        if self.laying.is_none() {
+            self.lay_aside().await?;
+        }
         let loaded = TagValue::Bool(true);
         // asked before it is ordered: after a crash the unit may have left already
         if self.runner.devices.io.read(tags::LOADED).await? != loaded {

@@ -282,26 +282,25 @@ impl RobotArm for ArmHandle {
     async fn wait(&self, ticket: Ticket, timeout_s: f64) -> Result<ArmState, DeviceError> {
         let deadline_s = lock(&self.world).now_s() + timeout_s.max(0.0);
         loop {
-            let end_s = {
-                let world = lock(&self.world);
-                let arm = &world.arms[self.index];
-                match arm.motion.as_ref().filter(|m| m.ticket == ticket.0) {
-                    Some(m) => m.alarm_at_s.unwrap_or(m.until_s),
-                    None => {
-                        return match &arm.ended {
-                            Some((ended, None)) if *ended == ticket.0 => Ok(arm.state(world.now_s())),
-                            Some((ended, Some(why))) if *ended == ticket.0 => Err(DeviceError::NotReady {
-                                device: self.name.clone(),
-                                state: why.clone(),
-                            }),
-                            _ => Err(self.refuse(format!(
-                                "ticket {} is not the last motion's; read the state",
-                                ticket.0
-                            ))),
-                        };
+            let end_s =
+                {
+                    let world = lock(&self.world);
+                    let arm = &world.arms[self.index];
+                    match arm.motion.as_ref().filter(|m| m.ticket == ticket.0) {
+                        Some(m) => m.alarm_at_s.unwrap_or(m.until_s),
+                        None => {
+                            return match &arm.ended {
+                                Some((ended, None)) if *ended == ticket.0 => Ok(arm.state(world.now_s())),
+                                Some((ended, Some(why))) if *ended == ticket.0 => Err(DeviceError::NotReady {
+                                    device: self.name.clone(),
+                                    state: why.clone(),
+                                }),
+                                _ => Err(self
+                                    .refuse(format!("ticket {} is not the last motion's; read the state", ticket.0))),
+                            };
+                        }
                     }
-                }
-            };
+                };
             until(&self.world, end_s.min(deadline_s)).await;
             if end_s > deadline_s {
                 return Err(self.timeout("wait", timeout_s));

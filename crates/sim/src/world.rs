@@ -185,7 +185,9 @@ impl World {
                 SimArm::new(name, seed, &settings.arms, tool, camera, i == 1, drawn.home_rad)
             })
             .collect();
-        let bodies = layout::ARMS.iter().filter_map(|(name, _)| ArmMotion::new(&drawing, name));
+        let bodies = layout::ARMS
+            .iter()
+            .filter_map(|(name, _)| ArmMotion::new(&drawing, name));
         Self {
             t_s: 0.0,
             acts: 0,
@@ -248,7 +250,9 @@ impl World {
 
     /// Two arms that touch each other stop, as real ones would.
     fn look_at_arms(&mut self) {
-        let (now_s, [a, b]) = (self.t_s, &self.bodies[..]) else { return };
+        let (now_s, [a, b]) = (self.t_s, &self.bodies[..]) else {
+            return;
+        };
         let apart_mm = a.apart_mm(self.arms[0].joints_at(now_s), b, self.arms[1].joints_at(now_s));
         self.nearest_arms_mm = self.nearest_arms_mm.min(apart_mm);
         if apart_mm < 0.0 {
@@ -709,7 +713,7 @@ mod tests {
         }
         // the lowest of tall units that lean are for the other arm
         assert!(screws > 1000 && by_second * 50 < screws, "{by_second} of {screws}");
-        // from a rest above the table most joint moves would swing the bit through the unit
-        assert!(around * 2 > screws, "{around} of {screws}");
+        // for some a straight joint move would swing the bit through the unit: then the way leads around it
+        assert!(around > 0 && around * 2 < screws, "{around} of {screws}");
     }
 }

@@ -176,7 +176,9 @@ impl Swept {
             !far(&self.boxes[a], &other.boxes[b])
                 && self.parts[a].iter().any(|part| {
                     other.parts[b].iter().any(|obstacle| {
-                        let balls_mm = nalgebra::distance(&part.middle(), &obstacle.middle()) - part.ball_mm() - obstacle.ball_mm();
+                        let balls_mm = nalgebra::distance(&part.middle(), &obstacle.middle())
+                            - part.ball_mm()
+                            - obstacle.ball_mm();
                         balls_mm < keep_mm && part.apart_mm(obstacle) < keep_mm
                     })
                 })

@@ -27,12 +27,12 @@ mod gp25;
 mod profile;
 mod trajectory;
 
+pub use collision::Swept;
 pub use drawing::{CellDrawing, DrawnArm, DrawnBox, DrawnCapsule, DrawnUnit};
 pub use gp25::{
     A1_MM, A2_MM, C1_MM, C2_MM, C3_MM, C4_MM, Gp25, HOME_RAD, Links, Unreachable, model_angles, within_limits,
 };
 pub use profile::{Limits, Profile};
-pub use collision::Swept;
 pub use trajectory::Trajectory;
 
 use crate::record::LeftAlone;
@@ -338,10 +338,7 @@ impl ArmMotion {
 
     /// Joint moves from in front of a face to the rest, the way that [`via_home`](Self::via_home) leads.
     pub fn way_home(&self, from_rad: [f64; 6]) -> Vec<Trajectory> {
-        match self
-            .via_home(from_rad)
-            .and_then(|via| self.arm.inverse(via).ok())
-        {
+        match self.via_home(from_rad).and_then(|via| self.arm.inverse(via).ok()) {
             Some(via_rad) => vec![
                 Trajectory::joint(from_rad, via_rad),
                 Trajectory::joint(via_rad, self.home_rad),
@@ -643,7 +640,9 @@ mod tests {
 
     #[test]
     fn home_is_gone_to_the_way_one_came() {
-        let arm = arm_among(&[]);
+        let mut drawing = CellDrawing::default();
+        drawing.arms[0].home_rad = HOME_RAD;
+        let arm = ArmMotion::new(&drawing, "arm_a").expect("a drawn arm");
         let way = check(&arm, HOME_RAD, [1070.0, -400.0, 200.0]).expect("free");
         let standoff_rad = way.approach.begin_rad();
         assert!(way.via().is_some() && arm.via_home(standoff_rad).is_some());

@@ -72,7 +72,10 @@ fn shared(candidates: &[Candidate], hands: [&Hand<'_>; 2], alone_s: f64, config:
         let of = |stretch: Stretch| stretch.into_iter().flatten();
         of(right).all(|r| of(left).all(|l| clear[r][l]))
     };
-    let arms = [(&hands[0].costs, tours[0].as_ref()), (&hands[1].costs, tours[1].as_ref())];
+    let arms = [
+        (&hands[0].costs, tours[0].as_ref()),
+        (&hands[1].costs, tours[1].as_ref()),
+    ];
     let shared = share(arms, &across_mm, &is_clear)?;
     if shared.span_s >= alone_s {
         return None;
@@ -92,10 +95,14 @@ fn shared(candidates: &[Candidate], hands: [&Hand<'_>; 2], alone_s: f64, config:
             .map(|k| left.iter().position(|l| *l == k).unwrap_or(0) + 1)
             .collect(),
     ];
-    if std::env::var("DBG").is_ok() { eprintln!("n {} alone {alone_s:.1} span {:.1} wait {:?} orders {:?} y {:?} reach {:?}", candidates.len(), shared.span_s, shared.wait_s, shared.orders, across_mm.iter().map(|y| *y as i64).collect::<Vec<_>>(), reaches); }
     let mut sides = [0, 1];
     sides.sort_by(|x, y| shared.wait_s[*x].total_cmp(&shared.wait_s[*y]));
-    let of = |side: usize| ways[side].iter().zip(&reaches[side]).map(|(way, reach)| way.target(candidates, *reach));
+    let of = |side: usize| {
+        ways[side]
+            .iter()
+            .zip(&reaches[side])
+            .map(|(way, reach)| way.target(candidates, *reach))
+    };
     Some(sides.into_iter().flat_map(of).collect())
 }
 
@@ -109,8 +116,17 @@ struct Ways<'a> {
 
 impl Ways<'_> {
     fn swept(&self, motion: &ArmMotion) -> Swept {
-        let legs = self.choice.way.joint.iter().chain(self.from_last.iter().flat_map(|way| &way.joint));
-        motion.swept(legs.map(|leg| &leg.trajectory).chain([&self.choice.way.approach]).chain(self.home))
+        let legs = self
+            .choice
+            .way
+            .joint
+            .iter()
+            .chain(self.from_last.iter().flat_map(|way| &way.joint));
+        motion.swept(
+            legs.map(|leg| &leg.trajectory)
+                .chain([&self.choice.way.approach])
+                .chain(self.home),
+        )
     }
 
     fn target(&self, candidates: &[Candidate], reach: usize) -> Target {
@@ -142,7 +158,12 @@ impl<'a> Hand<'a> {
             .map(|q| q.map_or_else(Vec::new, |q| reach.motion.way_home(q)))
             .collect();
         let out_s = |choice: &Option<&Choice>| match choice {
-            Some(choice) => choice.way.joint.iter().map(|leg| leg.trajectory.duration_s() + SETTLE_S).sum(),
+            Some(choice) => choice
+                .way
+                .joint
+                .iter()
+                .map(|leg| leg.trajectory.duration_s() + SETTLE_S)
+                .sum(),
             None => f64::INFINITY,
         };
         let back_s = |legs: &Vec<Trajectory>| match legs.is_empty() {
@@ -173,7 +194,10 @@ impl<'a> Hand<'a> {
     fn swept(&self, screw: usize) -> Option<Swept> {
         let way = &self.choices[screw]?.way;
         let legs = way.joint.iter().map(|leg| &leg.trajectory);
-        Some(self.motion.swept(legs.chain([&way.approach]).chain(&self.ways_home[screw])))
+        Some(
+            self.motion
+                .swept(legs.chain([&way.approach]).chain(&self.ways_home[screw])),
+        )
     }
 
     /// The ways of its order. From a screw where no way is free to the next it goes home first.

@@ -119,7 +119,8 @@ impl Way<'_> {
                     Work::Drive { arm: side, screw, .. } if stop.is_none() => {
                         let target = &targets[screw];
                         if !is_begun[screw] {
-                            self.observer.screw(is_begun.iter().filter(|b| **b).count(), targets.len());
+                            self.observer
+                                .screw(is_begun.iter().filter(|b| **b).count(), targets.len());
                         }
                         is_begun[screw] = true;
                         let program = match &mut tried[screw] {
@@ -139,7 +140,9 @@ impl Way<'_> {
                 }
             }
             // what is under way is seen to its end, whatever came up meanwhile
-            let Some((side, done, ended)) = next_of(&mut pending).await else { break };
+            let Some((side, done, ended)) = next_of(&mut pending).await else {
+                break;
+            };
             told = Told::Done(done.ticket);
             let (screw, ended) = match (ended, done.screw) {
                 (Ended::Burst(burst), Some(screw)) => (screw, burst),
@@ -150,7 +153,11 @@ impl Way<'_> {
                 _ => continue,
             };
             let target = &targets[screw];
-            let (bit, cause, failed) = (ended.program.map(|p| p.bit), Cause::of(ended.end), ended.error.is_some());
+            let (bit, cause, failed) = (
+                ended.program.map(|p| p.bit),
+                Cause::of(ended.end),
+                ended.error.is_some(),
+            );
             self.end_burst(target, ended)?;
             if failed && self.is_in_trouble(target).await {
                 trouble = Some(screw);

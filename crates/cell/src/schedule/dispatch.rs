@@ -227,7 +227,9 @@ impl Dispatcher {
             let of_arm = |arm: usize| {
                 let stops = mode.stops.iter().filter(|s| s.arm == arm).map(|s| s.screw);
                 let y_mm = |screw: usize| middle_mm + problem.product.faces[task.part].screws_mm[screw][0];
-                stops.map(|screw| (screw, reach_mm(arm, y_mm(screw), y_mm(screw)))).collect()
+                stops
+                    .map(|screw| (screw, reach_mm(arm, y_mm(screw), y_mm(screw))))
+                    .collect()
             };
             tasks[p.task] = Some(Fixed {
                 kind: task.kind,
@@ -266,11 +268,17 @@ impl Dispatcher {
     /// * `first` – the arm that may begin if not both can.
     /// * `retries` – how often a screw is tried again, after the others of its arm.
     pub fn at_face(screws: [Vec<(usize, Option<usize>)>; 2], first: usize, retries: u8) -> Self {
-        let most = screws.iter().flatten().filter_map(|(_, reach)| *reach).max().unwrap_or(0);
+        let most = screws
+            .iter()
+            .flatten()
+            .filter_map(|(_, reach)| *reach)
+            .max()
+            .unwrap_or(0);
         let [right, left] = screws;
         // a zone for each step
         let of = |list: Vec<(usize, Option<usize>)>, whole: usize| {
-            let reach = |(screw, reach): (usize, Option<usize>)| (screw, reach.unwrap_or(whole) as i64 * ZONE_MM as i64);
+            let reach =
+                |(screw, reach): (usize, Option<usize>)| (screw, reach.unwrap_or(whole) as i64 * ZONE_MM as i64);
             list.into_iter().map(reach).collect()
         };
         let task = Fixed {
@@ -393,6 +401,10 @@ impl Dispatcher {
                 attempt,
             } => {
                 self.arms[arm].busy = false;
+                // on the way it may have held more than it needs where it stands
+                if let Some(at_mm) = self.arms[arm].at_mm {
+                    self.take(arm, at_mm);
+                }
                 if !is_done {
                     if attempt < self.retries {
                         self.arms[arm].left.push_back((screw, attempt + 1));
@@ -743,7 +755,8 @@ mod tests {
             }
             for command in commands {
                 let rest_mm = |arm: usize| model.problem.station.arms[arm].rest_y_mm as i64;
-                let over = |places: &[i64]| Some((*places.iter().min().expect("one"), *places.iter().max().expect("one")));
+                let over =
+                    |places: &[i64]| Some((*places.iter().min().expect("one"), *places.iter().max().expect("one")));
                 match command.work {
                     Work::Drive { task, arm, screw, .. } => {
                         let task = &model.problem.tasks[task];
@@ -868,6 +881,140 @@ mod tests {
         "#;
         let states = check_all(text, 2, 2, 2, 0);
         assert!(states > 100, "{states} states");
+    }
+
+    /// One face that two arms share, and where each of them is or goes by its commands.
+    #[derive(Clone, Debug, PartialEq, Eq, Hash)]
+    struct Face {
+        dispatcher: Dispatcher,
+        /// Screws of each arm: where it stands or comes from, and where it goes.
+        at: [Vec<usize>; 2],
+        driven: Vec<(usize, u8)>,
+        meets: bool,
+    }
+
+    /// Every order of events and every failure at a face: reach of each screw by its number.
+    struct AtFace {
+        dispatcher: Dispatcher,
+        reach: [usize; 6],
+    }
+
+    impl AtFace {
+        fn told(&self, face: &mut Face, event: Event) {
+            let ended = match event {
+                Event::Done(ticket) | Event::Failed(ticket) => face.dispatcher.open.get(&ticket).cloned(),
+                Event::Begin => None,
+            };
+            match ended {
+                Some(Work::Drive { arm, screw, .. }) => face.at[arm] = vec![screw],
+                Some(Work::Withdraw { arm }) => face.at[arm].clear(),
+                _ => {}
+            }
+            for command in face.dispatcher.step(event) {
+                if let Work::Drive {
+                    arm, screw, attempt, ..
+                } = command.work
+                {
+                    face.at[arm].push(screw);
+                    face.driven.push((screw, attempt));
+                    face.driven.sort_unstable();
+                }
+            }
+            let [right, left] = [0, 1].map(|arm| face.at[arm].iter().map(|screw| self.reach[*screw]));
+            if let (Some(right), Some(left)) = (right.max(), left.min()) {
+                face.meets |= right >= left;
+            }
+        }
+    }
+
+    impl Model for AtFace {
+        type State = Face;
+        type Action = Event;
+
+        fn init_states(&self) -> Vec<Face> {
+            let mut face = Face {
+                dispatcher: self.dispatcher.clone(),
+                at: [Vec::new(), Vec::new()],
+                driven: Vec::new(),
+                meets: false,
+            };
+            self.told(&mut face, Event::Begin);
+            vec![face]
+        }
+
+        fn actions(&self, face: &Face, actions: &mut Vec<Event>) {
+            for (ticket, work) in face.dispatcher.open() {
+                actions.push(Event::Done(ticket));
+                if matches!(work, Work::Drive { .. }) {
+                    actions.push(Event::Failed(ticket));
+                }
+            }
+        }
+
+        fn next_state(&self, face: &Face, event: Event) -> Option<Face> {
+            let mut next = face.clone();
+            self.told(&mut next, event);
+            Some(next)
+        }
+
+        fn properties(&self) -> Vec<Property<Self>> {
+            vec![
+                Property::always("arms keep apart", |_, face: &Face| !face.meets),
+                Property::always("no burst is begun twice", |_, face: &Face| {
+                    face.driven.windows(2).all(|pair| pair[0] != pair[1])
+                }),
+                Property::always("something is under way, or all is over", |_, face: &Face| {
+                    face.dispatcher.open.is_empty() == face.dispatcher.is_finished()
+                }),
+                Property::always("no screw is left out", |_, face: &Face| {
+                    let all = (0..6).all(|screw| face.driven.contains(&(screw, 0)));
+                    all || !face.dispatcher.is_finished()
+                }),
+                Property::sometimes("both are at work", |_, face: &Face| {
+                    face.at.iter().all(|at| !at.is_empty())
+                }),
+            ]
+        }
+    }
+
+    #[test]
+    fn two_arms_at_a_face_never_wait_for_each_other_in_a_circle() {
+        // the right arm's screws and the left one's, with how far each reaches
+        for reach in [
+            [0, 2, 3, 4, 2, 1],
+            [0, 3, 1, 1, 3, 2],
+            [1, 3, 0, 2, 4, 1],
+            [1, 2, 3, 3, 2, 1],
+        ] {
+            for first in [0, 1] {
+                let of = |screws: std::ops::Range<usize>| screws.map(|k| (k, Some(reach[k]))).collect();
+                let model = AtFace {
+                    dispatcher: Dispatcher::at_face([of(0..3), of(3..6)], first, 1),
+                    reach,
+                };
+                let checker = model.checker().threads(2).spawn_bfs().join();
+                checker.assert_properties();
+                assert!(checker.unique_state_count() > 100, "{}", checker.unique_state_count());
+            }
+        }
+    }
+
+    /// Where nothing is said of the room, one arm does all of its own before the other begins.
+    #[test]
+    fn without_room_one_arm_rests() {
+        let mut dispatcher = Dispatcher::at_face([vec![(0, None), (1, None)], vec![(2, None)]], 1, 0);
+        let mut commands: VecDeque<Command> = dispatcher.step(Event::Begin).into();
+        let mut order = Vec::new();
+        while let Some(command) = commands.pop_front() {
+            assert!(commands.is_empty(), "one at a time: {commands:?}");
+            order.push(match command.work {
+                Work::Drive { screw, .. } => format!("screw {screw}"),
+                Work::Withdraw { arm } => format!("arm {arm} home"),
+                other => format!("{other:?}"),
+            });
+            commands.extend(dispatcher.step(Event::Done(command.ticket)));
+        }
+        assert_eq!(order, ["screw 2", "arm 1 home", "screw 0", "screw 1", "arm 0 home"]);
     }
 
     /// The shipped unit with events in the order of planned times; one screw never comes out.
