@@ -949,6 +949,38 @@ mod tests {
     }
 
     #[test]
+    fn two_arms_have_an_act_open_each_and_another_burst_is_recovery() {
+        let drive = |found: usize, arm: &str, burst: usize| Act::Drive {
+            found,
+            arm: arm.into(),
+            aim: Point::new(1.0, 2.0, 3.0),
+            burst,
+        };
+        let intent = |act: Act| Event::Intent { act };
+        let driven = |found: usize, arm: &str, end: DriveEnd| Event::Driven {
+            found,
+            arm: arm.into(),
+            burst: burst(end),
+        };
+        let (a, b) = (drive(0, "a", 0), drive(1, "b", 0));
+        let mut record = UnitRecord::new(1, 0.0);
+        record.apply(0.0, &seen());
+        record.apply(0.0, &intent(a.clone()));
+        record.apply(1.0, &intent(b.clone()));
+        assert_eq!((&record.open, &record.also_open), (&Some(b.clone()), &vec![a]));
+        record.apply(3.0, &driven(0, "a", DriveEnd::CamOut));
+        assert_eq!((&record.open, record.also_open.len()), (&Some(b), 0));
+        record.apply(3.0, &intent(drive(0, "a", 1)));
+        record.apply(4.0, &driven(1, "b", DriveEnd::Removed));
+        assert_eq!(record.open, Some(drive(0, "a", 1)));
+        record.apply(6.0, &driven(0, "a", DriveEnd::Removed));
+        assert_eq!((&record.open, record.also_open.len()), (&None, 0));
+        // what is spent on the second burst of a screw is recovery
+        assert_eq!((record.times.screws_s, record.times.recovery_s), (4.0, 2.0));
+        assert_eq!(record.screws_out(), 2);
+    }
+
+    #[test]
     fn an_act_stays_open_until_it_is_answered() {
         let mut record = UnitRecord::new(1, 0.0);
         let act = Act::Pull { cover: "top".into() };
