@@ -13,7 +13,7 @@ use crate::frames::KeptFrame;
 use crate::journal::{Journal, JournalError};
 use crate::ladder::{Cause, Climb};
 use crate::look::{self, Judge, Question};
-use crate::motion::ArmMotion;
+use crate::motion::{ArmMotion, Trajectory};
 use crate::packml::{Command, Illegal, Machine, State};
 use crate::plan::{self, Reach, SafeTarget, Target};
 use crate::program::{FaceId, Program, Step, Work};
@@ -24,7 +24,6 @@ use crate::record::{
 use crate::removal::Mover;
 use calibration::Map;
 use geometry::{Pixel, RgbdFrame};
-use std::pin::Pin;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
@@ -595,19 +594,49 @@ impl Way<'_> {
         Ok((look::cover_off(&shot.frame, before), self.keep(&shot)?))
     }
 
-    /// Sends the arms out of the way of table and camera.
+    /// Sends the arms out of the way of table and camera, one after the other. Where several are away from their rests, as after a stop in the
+    /// middle of their ways, one goes first whose way home is clear of where the others stand; if there is none, a person has to move one.
     async fn home(&mut self) -> Result<(), Stop> {
         self.gate().await?;
         let laying = self.laying.map(|(arm, _)| arm);
-        let arms = (0..self.runner.devices.arms.len()).filter(|arm| laying != Some(*arm));
-        // each turns back from its own side: who is away from its rest got there in a room of its own, or alone
-        let moves = arms
-            .filter_map(|arm| self.mover(arm))
-            .map(|mover| -> Pin<Box<dyn Future<Output = _> + '_>> { Box::pin(async move { mover.home().await }) });
-        for ended in face::all(moves.collect()).await {
-            ended?;
+        let mut away: Vec<(usize, [f64; 6])> = Vec::new();
+        for arm in (0..self.runner.devices.arms.len()).filter(|arm| laying != Some(*arm)) {
+            let state = self.runner.devices.arms[arm].robot.state().await?;
+            let motion = self.runner.motions.get(arm).and_then(Option::as_ref);
+            if state.running || motion.is_none_or(|motion| !motion.is_home(state.joints_rad)) {
+                away.push((arm, state.joints_rad));
+            }
+        }
+        while !away.is_empty() {
+            let Some(next) = (0..away.len()).find(|k| self.may_go_home(*k, &away)) else {
+                return Err(Stop::Device(DeviceError::NotReady {
+                    device: self.runner.devices.arms[away[0].0].robot.name().to_owned(),
+                    state:
+                        "away from its rest, and so is another arm that is in its way home; move one of them by hand"
+                            .into(),
+                }));
+            };
+            let (arm, _) = away.remove(next);
+            if let Some(mover) = self.mover(arm) {
+                mover.home().await?;
+            }
         }
         Ok(())
+    }
+
+    /// True if an arm's way home keeps the margin from where the others stand that are away from their rests.
+    fn may_go_home(&self, number: usize, away: &[(usize, [f64; 6])]) -> bool {
+        let motion = |arm: usize| self.runner.motions.get(arm).and_then(Option::as_ref);
+        let (arm, joints_rad) = away[number];
+        let others = away.iter().filter(|(other, _)| *other != arm);
+        // of one that is not drawn nothing is known; it carries no driver
+        let Some(own) = motion(arm) else { return true };
+        let way = own.swept(&own.way_home(joints_rad));
+        let margin_mm = self.runner.config.motion.margin_mm;
+        let stands = |at: &[f64; 6]| Trajectory::joint(*at, *at);
+        others
+            .map(|(other, at)| motion(*other).map(|other| other.swept([&stands(at)])))
+            .all(|there| there.is_none_or(|there| way.is_clear_of(&there, margin_mm)))
     }
 
     async fn turn(&mut self, face: &FaceId) -> Result<(), Stop> {

@@ -191,11 +191,13 @@ impl Way<'_> {
                 Some(_) => tried.waits = true,
             }
         }
+        if let Some(screw) = trouble {
+            self.put_right(&targets[screw]).await?;
+        }
         if let Some(stop) = stop {
             return Err(stop);
         }
-        if let Some(screw) = trouble {
-            self.put_right(&targets[screw]).await?;
+        if trouble.is_some() {
             // what was to be come back to has waited long enough
             for tried in tried.iter_mut().flatten() {
                 tried.waits |= tried.climb.peek(tried.cause, 0).is_some();
@@ -335,23 +337,4 @@ async fn next_of<'a>(pending: &mut [Option<Pending<'a>>]) -> Option<(usize, Pend
     .await;
     let done = pending[side].take()?;
     Some((side, done, ended))
-}
-
-/// Ends of all futures, in their order; all are under way at the same time.
-pub(super) async fn all<T>(futures: Vec<Pin<Box<dyn Future<Output = T> + '_>>>) -> Vec<T> {
-    let mut futures: Vec<(Option<T>, _)> = futures.into_iter().map(|f| (None, f)).collect();
-    poll_fn(|context| {
-        for (done, future) in futures.iter_mut().filter(|(done, _)| done.is_none()) {
-            if let Poll::Ready(ended) = future.as_mut().poll(context) {
-                *done = Some(ended);
-            }
-        }
-        if futures.iter().all(|(done, _)| done.is_some()) {
-            Poll::Ready(())
-        } else {
-            Poll::Pending
-        }
-    })
-    .await;
-    futures.into_iter().filter_map(|(done, _)| done).collect()
 }
