@@ -126,6 +126,7 @@ pub async fn capture_pairs(
         timeouts: settings.timeouts,
         clock: &devices.clock,
         motion: None,
+        room: None,
     };
     let mut complete = true;
     for target in plan.iter().filter(|t| !known.contains(&t.id)) {

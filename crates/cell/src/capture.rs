@@ -60,21 +60,31 @@ pub async fn present(devices: &Devices, face: &FaceId, timeout_s: f64) -> Result
     }
 }
 
-/// Takes a shot of the whole view or of a region; depth is the mean of `depth_frames` frames, none for 0.
+/// Takes a shot of the whole view or of a region; depth is the mean of `depth_frames` frames, none for 0. Both cameras work at the same time.
 ///
 /// # Errors
 /// What a camera says; a grab that failed is tried once more, since taking a picture changes nothing.
 pub async fn shoot(devices: &Devices, region: Option<Region>, depth_frames: usize) -> Result<Shot, DeviceError> {
-    let color = match devices.color.grab(region).await {
-        Err(DeviceError::Timeout { .. } | DeviceError::Fault { .. }) => devices.color.grab(region).await?,
-        other => other?,
+    let color = async {
+        match devices.color.grab(region).await {
+            Err(DeviceError::Timeout { .. } | DeviceError::Fault { .. }) => devices.color.grab(region).await,
+            other => other,
+        }
     };
+    let depth = async {
+        let mut frames: Vec<DepthFrame> = Vec::with_capacity(depth_frames);
+        for _ in 0..depth_frames {
+            frames.push(match devices.depth.grab(region).await {
+                Err(DeviceError::Timeout { .. } | DeviceError::Fault { .. }) => devices.depth.grab(region).await?,
+                other => other?,
+            });
+        }
+        Ok::<_, DeviceError>(frames)
+    };
+    let (color, frames) = tokio::join!(color, depth);
+    let (color, frames) = (color?, frames?);
     let mut mean: Option<Mean> = None;
-    for _ in 0..depth_frames {
-        let frame = match devices.depth.grab(region).await {
-            Err(DeviceError::Timeout { .. } | DeviceError::Fault { .. }) => devices.depth.grab(region).await?,
-            other => other?,
-        };
+    for frame in frames {
         check_registered(&color, &frame)?;
         match &mut mean {
             Some(mean) => mean.add(&frame.map),

@@ -71,6 +71,9 @@ pub struct CellConfig {
     /// What the arms could run into.
     #[serde(default)]
     pub motion: CellDrawing,
+    /// Who works when.
+    #[serde(default)]
+    pub work: Work,
     /// How screws are driven.
     #[serde(default)]
     pub drive: Drive,
@@ -191,6 +194,20 @@ impl Default for Approach {
     }
 }
 
+/// Who works when.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Work {
+    /// Arms that take screws out at the same time, 1 or 2. With 1 a second arm does only what the first cannot reach, and pulls covers.
+    pub arms: usize,
+}
+
+impl Default for Work {
+    fn default() -> Self {
+        Self { arms: 2 }
+    }
+}
+
 /// The bounded programme that every screw is begun with; what follows is the [`Ladder`]'s.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -296,6 +313,7 @@ impl CellConfig {
             exclusion: Exclusion::default(),
             approach: Approach::default(),
             motion: CellDrawing::default(),
+            work: Work::default(),
             drive: Drive::default(),
             ladder: Ladder::default(),
             help: Help::default(),
@@ -385,6 +403,7 @@ impl CellConfig {
             1e6,
             "0 to 1,000,000",
         )?;
+        within("work.arms", self.work.arms as f64, 1.0, 2.0, "1 or 2")?;
         let approach = &self.approach;
         within("approach.standoff_mm", approach.standoff_mm, 10.0, 60.0, "10 to 60 mm")?;
         within(

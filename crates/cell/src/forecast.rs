@@ -125,6 +125,9 @@ pub struct UnitAssumptions {
 pub struct ScrewAssumptions {
     /// Called a screw at the first look.
     pub found: Chance,
+    /// Called a screw or left in doubt at the first look: what is in doubt is driven at when its cover stays.
+    #[serde(default = "seen")]
+    pub seen: Chance,
     /// Of those that were not: found when the cover that it holds stays.
     pub found_later: Chance,
     /// Of those that were not: seen at all, so that a person who looks at the picture would say that it is one.
@@ -133,6 +136,11 @@ pub struct ScrewAssumptions {
     pub out_at_once: Chance,
     /// Of those that were not: out after the cell's own ladder (harder, look again, search).
     pub out_after_ladder: Chance,
+}
+
+/// This detector's on its own rendered faces.
+fn seen() -> Chance {
+    Chance::Counted { hits: 700, of: 706 }
 }
 
 /// How long things take, s.
@@ -196,6 +204,7 @@ impl Default for Assumptions {
             },
             screw: ScrewAssumptions {
                 found: Chance::Counted { hits: 692, of: 706 },
+                seen: seen(),
                 found_later: Chance::Known(0.5),
                 person_sees: Chance::Known(0.9),
                 out_at_once: Chance::Known(0.96),
@@ -343,6 +352,7 @@ impl Assumptions {
         let chances = [
             ("unit.cover_jams", self.unit.cover_jams),
             ("screw.found", s.found),
+            ("screw.seen", s.seen),
             ("screw.found_later", s.found_later),
             ("screw.person_sees", s.person_sees),
             ("screw.out_at_once", s.out_at_once),
@@ -662,46 +672,123 @@ fn unit(a: &Assumptions, d: &Drawn, rng: &mut Pcg64Mcg, sums: &mut Sums) {
 pub struct Prediction {
     /// Number of the unit.
     pub unit: u64,
-    /// From the scores of its own screws, as they were before anything was done to them.
+    /// From the scores of its own screws, as they were before anything was done to them, and from the units before it.
     pub predicted: f64,
     /// What became of it.
     pub finished: bool,
 }
 
-/// Predictions for the finished units in scope: every find that was acted on comes out, and no find that was left alone in doubt
-/// holds a cover.
-pub fn predictions(a: &Assumptions, units: &[Digest]) -> Vec<Prediction> {
-    let in_scope = units.iter().filter_map(|unit| match unit.outcome.as_ref()? {
-        Outcome::Ok => Some((unit, true)),
-        Outcome::Ng { .. } => Some((unit, false)),
-        Outcome::Excluded { .. } => None,
-    });
-    in_scope
-        .map(|(unit, finished)| Prediction {
-            unit: unit.unit,
-            predicted: unaided(
-                a,
-                unit.scores_acted_on.iter().copied(),
-                unit.scores_in_doubt.iter().copied(),
-            ),
-            finished,
-        })
-        .collect()
+/// What an assumed chance is worth beside counts, as so many trials.
+const ASSUMED_WORTH: f64 = 10.0;
+
+/// A chance that is learnt from unit to unit: an assumption, and what was counted since (the mean of a Beta distribution).
+#[derive(Clone, Copy)]
+struct Learnt {
+    hits: f64,
+    of: f64,
 }
 
-/// Probability that all comes out.
+impl Learnt {
+    fn from(chance: Chance) -> Self {
+        match chance {
+            Chance::Known(p) => Self {
+                hits: p * ASSUMED_WORTH,
+                of: ASSUMED_WORTH,
+            },
+            Chance::Counted { hits, of } => Self {
+                hits: hits as f64 + 0.5,
+                of: of as f64 + 1.0,
+            },
+        }
+    }
+
+    fn saw(&mut self, hits: usize, misses: usize) {
+        self.hits += hits as f64;
+        self.of += (hits + misses) as f64;
+    }
+
+    fn mean(self) -> f64 {
+        self.hits / self.of
+    }
+}
+
+/// The chances of a unit's screws, as far as they are known before it comes.
+struct Chances {
+    seen: Learnt,
+    found_later: Learnt,
+    out_at_once: Learnt,
+    out_after_ladder: Learnt,
+    cover_jams: f64,
+}
+
+impl Chances {
+    fn of(a: &Assumptions) -> Self {
+        Self {
+            seen: Learnt::from(a.screw.seen),
+            found_later: Learnt::from(a.screw.found_later),
+            out_at_once: Learnt::from(a.screw.out_at_once),
+            out_after_ladder: Learnt::from(a.screw.out_after_ladder),
+            cover_jams: a.unit.cover_jams.mean(),
+        }
+    }
+
+    /// Takes note of a unit that is done.
+    fn learn(&mut self, unit: &Digest) {
+        self.out_at_once.saw(unit.out_at_once, unit.out_later + unit.stayed);
+        self.out_after_ladder.saw(unit.out_later, unit.stayed);
+        // a cover that stayed for no reason that was seen: a screw that was not found
+        let stuck = matches!(
+            unit.outcome,
+            Some(Outcome::Ng {
+                reason: NgReason::CoverStuck,
+                ..
+            })
+        );
+        self.found_later.saw(unit.found_later, stuck.into());
+        self.seen.saw(unit.removed + unit.stayed, stuck.into());
+    }
+
+    /// Probability that all comes out.
+    ///
+    /// # Arguments
+    /// * `finds` – for each find, the probability that it is a screw: those that are driven at, and those that are left in doubt, which are
+    ///   driven at when their cover stays.
+    fn unaided(&self, finds: &[f64]) -> f64 {
+        let once = self.out_at_once.mean();
+        let out = once + (1.0 - once) * self.out_after_ladder.mean();
+        // a find that is no screw holds nothing: the cover comes off without it
+        let seen: f64 = finds.iter().map(|p| 1.0 - p * (1.0 - out)).product();
+        // beside the screws that are seen there are some that are not
+        let unseen = finds.iter().sum::<f64>() * (1.0 / self.seen.mean() - 1.0);
+        let each_stays = 1.0 - self.found_later.mean() * out;
+        seen * (-unseen * each_stays).exp() * (1.0 - self.cover_jams)
+    }
+}
+
+/// Predictions for the finished units in scope. Each knows its own finds and what became of the units before it, nothing of what came after.
 ///
 /// # Arguments
-/// * `acted_on` – for each find that is driven at, the probability that it is a screw.
-/// * `in_doubt` – for each find that is left alone, the probability that it is one after all.
-fn unaided(a: &Assumptions, acted_on: impl Iterator<Item = f64>, in_doubt: impl Iterator<Item = f64>) -> f64 {
-    let s = &a.screw;
-    let once = s.out_at_once.mean();
-    let out = once + (1.0 - once) * s.out_after_ladder.mean();
-    // a find that is no screw holds nothing: the cover comes off without it
-    let sure: f64 = acted_on.map(|p| p * out + (1.0 - p)).product();
-    let doubtful: f64 = in_doubt.map(|p| 1.0 - p * (1.0 - s.found_later.mean() * out)).product();
-    sure * doubtful * (1.0 - a.unit.cover_jams.mean())
+/// * `units` – in the order in which they came.
+pub fn predictions(a: &Assumptions, units: &[Digest]) -> Vec<Prediction> {
+    let mut chances = Chances::of(a);
+    let mut predictions = Vec::new();
+    for unit in units {
+        let finished = match unit.outcome {
+            Some(Outcome::Ok) => Some(true),
+            Some(Outcome::Ng { .. }) => Some(false),
+            Some(Outcome::Excluded { .. }) | None => None,
+        };
+        if let Some(finished) = finished {
+            let finds = [&unit.scores_acted_on[..], &unit.scores_in_doubt[..]].concat();
+            predictions.push(Prediction {
+                unit: unit.unit,
+                predicted: chances.unaided(&finds),
+                finished,
+            });
+        }
+        chances.learn(unit);
+    }
+    predictions
 }
 
 #[cfg(test)]
@@ -779,12 +866,62 @@ mod tests {
     }
 
     #[test]
-    fn a_prediction_falls_with_every_doubt() {
-        let a = Assumptions::default();
-        let of = |fits: &[f64], doubt: &[f64]| unaided(&a, fits.iter().copied(), doubt.iter().copied());
-        assert!((of(&[], &[]) - 0.995).abs() < 1e-9);
-        assert!(of(&[1.0; 20], &[]) < of(&[1.0; 10], &[]));
-        assert!(of(&[1.0; 10], &[0.5]) < of(&[1.0; 10], &[]));
-        assert!((of(&[0.0; 10], &[]) - 0.995).abs() < 1e-9); // what is no screw holds nothing
+    fn a_prediction_falls_with_every_screw_that_there_may_be() {
+        let chances = Chances::of(&Assumptions::default());
+        assert!((chances.unaided(&[]) - 0.995).abs() < 1e-9);
+        assert!(chances.unaided(&[1.0; 20]) < chances.unaided(&[1.0; 10]));
+        assert!(chances.unaided(&[0.5; 10]) > chances.unaided(&[1.0; 10]));
+        assert!((chances.unaided(&[0.0; 10]) - 0.995).abs() < 1e-9); // what is no screw holds nothing
+    }
+
+    /// Units drawn from chances that differ from the assumed ones: what is predicted becomes what happens, and no unit is told its own end.
+    #[test]
+    fn predictions_come_to_be_what_happens() {
+        let (once, ladder, doubt) = (0.9, 0.9, 0.4);
+        let mut rng = Pcg64Mcg::seed_from_u64(11);
+        let units: Vec<Digest> = (0..1200)
+            .map(|number| {
+                let mut unit = Digest::of(&UnitRecord::new(number, 0.0));
+                for k in 0..22 {
+                    let (score, is_screw) = if k < 2 {
+                        (doubt, rng.random_bool(doubt))
+                    } else {
+                        (1.0, true)
+                    };
+                    if k < 2 {
+                        unit.scores_in_doubt.push(score);
+                    } else {
+                        unit.scores_acted_on.push(score);
+                    }
+                    match (is_screw, rng.random_bool(once), rng.random_bool(ladder)) {
+                        (false, ..) => {}
+                        (_, true, _) => unit.out_at_once += 1,
+                        (_, _, true) => unit.out_later += 1,
+                        _ => unit.stayed += 1,
+                    }
+                }
+                unit.removed = unit.out_at_once + unit.out_later;
+                let stays = NgReason::ScrewSeized;
+                unit.outcome = Some(if unit.stayed == 0 {
+                    Outcome::Ok
+                } else {
+                    Outcome::Ng {
+                        reason: stays,
+                        detail: String::new(),
+                    }
+                });
+                unit
+            })
+            .collect();
+        let told = predictions(&Assumptions::default(), &units);
+        let mean = |of: &dyn Fn(&Prediction) -> f64| told[200..].iter().map(of).sum::<f64>() / 1000.0;
+        let (predicted, finished) = (mean(&|p| p.predicted), mean(&|p| f64::from(u8::from(p.finished))));
+        assert!((0.7..0.9).contains(&finished), "{finished}");
+        assert!(
+            (predicted - finished).abs() < 0.05,
+            "{predicted} predicted, {finished} finished"
+        );
+        // what comes later changes nothing
+        assert_eq!(predictions(&Assumptions::default(), &units[..50]), told[..50]);
     }
 }

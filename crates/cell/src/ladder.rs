@@ -171,6 +171,13 @@ impl<'a> Climb<'a> {
     /// # Arguments
     /// * `bursts` – bursts at this screw so far.
     pub fn next(&mut self, cause: Cause, bursts: usize) -> Option<Rung> {
+        let rung = self.peek(cause, bursts);
+        self.used[cause as usize] += usize::from(rung.is_some());
+        rung
+    }
+
+    /// The same, but it does not count as used.
+    pub fn peek(&self, cause: Cause, bursts: usize) -> Option<Rung> {
         if bursts >= self.ladder.bursts_max {
             return None;
         }
@@ -181,10 +188,7 @@ impl<'a> Climb<'a> {
             Cause::TimeOut => &self.ladder.time_out,
             Cause::StillThere => &self.ladder.still_there,
         };
-        let used = &mut self.used[cause as usize];
-        let rung = rungs.get(*used).copied();
-        *used += usize::from(rung.is_some());
-        rung
+        rungs.get(self.used[cause as usize]).copied()
     }
 }
 

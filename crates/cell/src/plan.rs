@@ -4,6 +4,8 @@
 //! screw and the way to it, and from an arm that can go that way without running into anything. What lies at the border or
 //! outside, or behind something, is reported, never commanded.
 
+mod allot;
+
 use crate::capture::{FaceFit, Shot, sheet_normal, tilt_rad};
 use crate::config::{Approach, CellConfig};
 use crate::motion::{ArmMotion, Refusal, Way};
@@ -14,6 +16,9 @@ use nalgebra::{Matrix3, Rotation3, UnitQuaternion, Vector3};
 
 /// Shortest way in front of a screw on which the bit can still be lined up, mm.
 const SHORTEST_STANDOFF_MM: f64 = 8.0;
+
+/// Joint angles that differ by less belong to the same way, rad: a millimetre at the bit.
+const SAME_WAY_RAD: f64 = 5e-4;
 
 /// The screws of a face stand no farther in front of its plane or behind it, mm: ribs and sunk flanges.
 const ON_FACE_MM: f64 = 20.0;
@@ -40,6 +45,9 @@ impl SafeTarget {
     /// * `normal` – of the surface, towards the camera: the bit comes against it.
     /// * `approach` – its standoff is shortened where the volume ends before.
     ///
+    /// # Returns
+    /// The place, and the free way there.
+    ///
     /// # Errors
     /// [`Refused`], if the point or every straight way to it leaves the volume, or the arm cannot go there safely.
     pub fn locate(
@@ -47,10 +55,10 @@ impl SafeTarget {
         point: Point<Camera>,
         normal: Direction<Camera>,
         approach: &Approach,
-    ) -> Result<Self, Refused> {
+    ) -> Result<(Self, Way), Refused> {
         let place = Self::in_volume(reach, point, normal, approach.standoff_mm)?;
-        place.check(reach.motion, reach.joints_rad, approach)?;
-        Ok(place)
+        let way = place.check(reach.motion, reach.joints_rad, approach)?;
+        Ok((place, way))
     }
 
     fn in_volume(
@@ -145,13 +153,58 @@ pub fn tool_pose(tip: Point<Base>, approach: Direction<Base>) -> Transform<Base,
     Transform::from_parts(tip.to_array(), UnitQuaternion::from_rotation_matrix(&rotation))
 }
 
+/// A screw that an arm could take out, and how.
+#[derive(Clone, Debug)]
+struct Candidate {
+    /// Its number in [`FaceRecord::found`].
+    found: usize,
+    point: Point<Camera>,
+    choices: Vec<Choice>,
+}
+
+/// An arm's way to a screw.
+#[derive(Clone, Debug)]
+struct Choice {
+    place: SafeTarget,
+    way: Way,
+}
+
 /// A screw that will be acted on.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct Target {
     /// Its number in [`FaceRecord::found`].
     pub found: usize,
     /// Where the arm may go.
     pub place: SafeTarget,
+    /// The room that is kept for it; `None` if the other arm rests meanwhile.
+    pub room: Option<Room>,
+}
+
+/// What an arm may do at a screw while the other one is at work: the ways whose room was looked at when the face was shared out.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Room {
+    /// How far across it reaches, in steps: 0 wherever the other arm is; see [`Dispatcher::at_face`](crate::schedule::dispatch::Dispatcher::at_face).
+    pub reach: usize,
+    /// Where the joints are from the rest to in front of it: at the beginning and at the end of each move, rad.
+    pub from_rest_rad: Vec<[f64; 6]>,
+    /// The same from in front of the screw before; empty where it is come to from the rest.
+    pub from_last_rad: Vec<[f64; 6]>,
+}
+
+impl Room {
+    /// True if a way is one of those that were looked at, or leads nowhere from in front of the screw.
+    pub fn holds(&self, way: &Way) -> bool {
+        let near = |a: &[f64; 6], b: &[f64; 6]| (0..6).all(|j| (a[j] - b[j]).abs() < SAME_WAY_RAD);
+        let begin = way.joint.first().map(|leg| leg.trajectory.begin_rad());
+        let ends = way.joint.iter().map(|leg| leg.trajectory.end_rad());
+        let at: Vec<[f64; 6]> = begin.into_iter().chain(ends).collect();
+        let is =
+            |planned: &Vec<[f64; 6]>| planned.len() == at.len() && planned.iter().zip(&at).all(|(a, b)| near(a, b));
+        let there = self.from_rest_rad.last();
+        is(&self.from_rest_rad)
+            || is(&self.from_last_rad)
+            || at.iter().all(|q| there.is_some_and(|there| near(q, there)))
+    }
 }
 
 /// An arm that can take screws out.
@@ -263,7 +316,7 @@ pub fn bound_doubtful(screws: &mut [vision::Screw], odds: f64, most: usize, befo
 /// Turns the detector's finds into records and targets.
 ///
 /// # Returns
-/// Every find with its place and, if it is left alone, the reason; and the targets in the order in which to do them.
+/// Every find with its place and, if it is left alone, the reason; and the targets: which arm does which, in which order.
 pub fn plan(
     screws: &[vision::Screw],
     shot: &Shot,
@@ -272,18 +325,30 @@ pub fn plan(
     config: &CellConfig,
 ) -> (Vec<Found>, Vec<Target>) {
     let mut found = Vec::with_capacity(screws.len());
-    let mut targets = Vec::new();
+    let mut candidates = Vec::new();
     for screw in screws {
-        let (entry, place) = judge(screw, shot, face, arms, config);
-        if let Some(place) = place {
-            targets.push(Target {
+        let (entry, choices) = judge(screw, shot, face, arms, config);
+        if let (false, Some(point)) = (choices.is_empty(), screw.camera) {
+            candidates.push(Candidate {
                 found: found.len(),
-                place,
+                point,
+                choices,
             });
         }
         found.push(entry);
     }
-    (found, ordered(targets))
+    let targets = allot::allot(&candidates, arms, config);
+    for (target, candidate) in targets
+        .iter()
+        .filter_map(|t| Some((t, candidates.iter().find(|c| c.found == t.found)?)))
+    {
+        // the arm that goes there decides what the record says
+        if let Some(reach) = arms.iter().find(|r| r.arm == target.place.arm()) {
+            found[target.found].base_mm = Some(target.place.tip());
+            found[target.found].hull = Some(reach.map.apply(candidate.point).hull);
+        }
+    }
+    (found, targets)
 }
 
 fn judge(
@@ -292,7 +357,7 @@ fn judge(
     face: Option<&FaceFit>,
     arms: &[Reach<'_>],
     config: &CellConfig,
-) -> (Found, Option<SafeTarget>) {
+) -> (Found, Vec<Choice>) {
     let whole = shot.to_whole(screw.pixel);
     let sheet = sheet_normal(&shot.frame, screw.pixel, screw.diameter_px);
     let mapped: Option<MappedPoint> = screw
@@ -315,24 +380,17 @@ fn judge(
         left_alone: None,
         refusal: None,
     };
-    let place = target(screw, &found, shot, sheet, face, arms, config);
-    match place {
-        Ok(place) => {
-            // the arm that goes there decides what the record says
-            if let (Some(reach), Some(point)) = (arms.iter().find(|r| r.arm == place.arm()), screw.camera) {
-                found.base_mm = Some(place.tip());
-                found.hull = Some(reach.map.apply(point).hull);
-            }
-            (found, Some(place))
-        }
+    match target(screw, &found, shot, sheet, face, arms, config) {
+        Ok(choices) => (found, choices),
         Err(refused) => {
             found.left_alone = Some(refused.why);
             found.refusal = refused.detail;
-            (found, None)
+            (found, Vec::new())
         }
     }
 }
 
+/// Every arm that can go to a screw, in the order of the arms.
 fn target(
     screw: &vision::Screw,
     found: &Found,
@@ -341,7 +399,7 @@ fn target(
     face: Option<&FaceFit>,
     arms: &[Reach<'_>],
     config: &CellConfig,
-) -> Result<SafeTarget, Refused> {
+) -> Result<Vec<Choice>, Refused> {
     match screw.verdict {
         Verdict::Screw => {}
         Verdict::Other => return Err(LeftAlone::OtherDrive.into()),
@@ -359,13 +417,17 @@ fn target(
     }
     let normal = line_of_approach(sheet, head_normal(screw), face, config).ok_or(LeftAlone::NoDepth)?;
     let mut refused = Refused::from(LeftAlone::HullOutside);
+    let mut choices = Vec::new();
     for reach in arms {
         match SafeTarget::locate(reach, point, normal, &config.approach) {
-            Ok(place) => return Ok(place),
+            Ok((place, way)) => choices.push(Choice { place, way }),
             Err(why) => refused = refused.or(why),
         }
+        if config.work.arms < 2 && !choices.is_empty() {
+            break; // the others only stand in for the first
+        }
     }
-    Err(refused)
+    if choices.is_empty() { Err(refused) } else { Ok(choices) }
 }
 
 fn is_head_size(diameter_px: f64, point: Point<Camera>, shot: &Shot, config: &CellConfig) -> bool {
@@ -403,48 +465,6 @@ fn line_of_approach(
         (Some(sheet), Some(head)) if leans(sheet) && leans(head) => Some(sheet),
         _ => Some(face),
     }
-}
-
-/// The order in which to do them: nearest neighbour, then 2-opt on the open way. A small lever (117 to 125 s of 125), so nothing more.
-fn ordered(mut targets: Vec<Target>) -> Vec<Target> {
-    let distance_mm = |a: &Target, b: &Target| {
-        let other_arm = if a.place.arm() == b.place.arm() { 0.0 } else { 1e6 };
-        a.place.tip().distance_mm(b.place.tip()) + other_arm
-    };
-    let n = targets.len();
-    // begin at an end of the way: the target furthest from the middle
-    let middle = targets.iter().map(|t| t.place.tip().vector()).sum::<Vector3<f64>>() / n.max(1) as f64;
-    let first = (0..n).max_by(|&a, &b| {
-        let far = |k: usize| (targets[k].place.tip().vector() - middle).norm();
-        far(a).total_cmp(&far(b))
-    });
-    if let Some(first) = first {
-        targets.swap(0, first);
-    }
-    for k in 1..n {
-        let next = (k..n).min_by(|&a, &b| {
-            distance_mm(&targets[k - 1], &targets[a]).total_cmp(&distance_mm(&targets[k - 1], &targets[b]))
-        });
-        if let Some(next) = next {
-            targets.swap(k, next);
-        }
-    }
-    let mut better = true;
-    while better {
-        better = false;
-        for i in 0..n.saturating_sub(1) {
-            for j in i + 1..n {
-                let link = |a: usize, b: usize| distance_mm(&targets[a], &targets[b]);
-                let before = if i > 0 { link(i - 1, i) } else { 0.0 } + if j + 1 < n { link(j, j + 1) } else { 0.0 };
-                let after = if i > 0 { link(i - 1, j) } else { 0.0 } + if j + 1 < n { link(i, j + 1) } else { 0.0 };
-                if after + 1e-9 < before {
-                    targets[i..=j].reverse();
-                    better = true;
-                }
-            }
-        }
-    }
-    targets
 }
 
 /// Why a unit is excluded after this look at a face, if it is: judged on the picture, before anything on the face is touched.

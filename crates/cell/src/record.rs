@@ -625,6 +625,9 @@ pub struct UnitRecord {
     pub resumed: u32,
     /// The act that was begun and whose end is not known: look before anything else.
     pub open: Option<Act>,
+    /// Acts of other arms that were begun besides.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub also_open: Vec<Act>,
     /// True once it has left the table.
     pub discharged: bool,
     /// True while time counts as recovery.
@@ -652,6 +655,7 @@ impl UnitRecord {
             times: Times::default(),
             resumed: 0,
             open: None,
+            also_open: Vec::new(),
             discharged: false,
             recovering: false,
             looks: Vec::new(),
@@ -673,7 +677,7 @@ impl UnitRecord {
         let spent_s = (t_s - self.last_s).max(0.0);
         let resource = match event.resource() {
             Resource::Waiting => Resource::Waiting,
-            _ if self.recovering => Resource::Recovery,
+            _ if self.recovering || self.is_again(event) => Resource::Recovery,
             resource => resource,
         };
         self.times.add(resource, spent_s);
@@ -685,12 +689,12 @@ impl UnitRecord {
                 self.resumed += 1;
                 self.recovering = false;
             }
-            Event::Intent { act } => self.open = Some(act.clone()),
-            Event::Presented { .. } => self.open = None,
+            Event::Intent { act } => self.begun(act),
+            Event::Presented { .. } => self.nothing_open(),
             // A look at the world answers whatever was in doubt about it; what it showed is in the record that comes with it.
             Event::Seen { face, .. } => {
                 self.faces.push((**face).clone());
-                self.open = None;
+                self.nothing_open();
             }
             Event::Asked { clicks, picture, .. } => {
                 self.looks.push(picture.clone());
@@ -705,7 +709,7 @@ impl UnitRecord {
                 }
             }
             Event::Driven { found, arm, burst } => {
-                self.open = None;
+                self.ended(*found, arm);
                 // a cut that was begun has left its mark, whatever came of it
                 if burst.program.is_some_and(|p| p.bit == Bit::Mill) {
                     self.method = Method::Destructive;
@@ -737,7 +741,7 @@ impl UnitRecord {
                 }
             }
             Event::Pulled { cover, .. } => {
-                self.open = None;
+                self.nothing_open();
                 self.covers.push(cover.clone());
             }
             Event::Recovery { on } => self.recovering = *on,
@@ -755,9 +759,46 @@ impl UnitRecord {
                 self.outcome = Some(outcome.clone());
             }
             Event::Discharged => {
-                self.open = None;
+                self.nothing_open();
                 self.discharged = true;
             }
+        }
+    }
+
+    /// Two arms may drive at the same time; nothing else is begun beside anything.
+    fn begun(&mut self, act: &Act) {
+        match (act, self.open.take()) {
+            (Act::Drive { .. }, Some(other @ Act::Drive { .. })) => self.also_open.push(other),
+            _ => self.also_open.clear(),
+        }
+        self.open = Some(act.clone());
+    }
+
+    fn ended(&mut self, found: usize, arm: &str) {
+        let is_it = |act: &Act| matches!(act, Act::Drive { found: f, arm: a, .. } if *f == found && a == arm);
+        self.also_open.retain(|act| !is_it(act));
+        if self.open.as_ref().is_none_or(is_it) {
+            self.open = self.also_open.pop();
+        }
+    }
+
+    fn nothing_open(&mut self) {
+        self.open = None;
+        self.also_open.clear();
+    }
+
+    /// True for another burst at a screw that the first one did not take out.
+    fn is_again(&self, event: &Event) -> bool {
+        let tried = |found: usize| {
+            let attempts = self.faces.last().into_iter().flat_map(|f| &f.attempts);
+            attempts.filter(|a| a.found == found).count() > 0
+        };
+        match event {
+            Event::Intent {
+                act: Act::Drive { burst, .. },
+            } => *burst > 0,
+            Event::Driven { found, .. } => tried(*found),
+            _ => false,
         }
     }
 
@@ -905,6 +946,38 @@ mod tests {
             },
         );
         assert_eq!(record.screws_out(), 1);
+    }
+
+    #[test]
+    fn two_arms_have_an_act_open_each_and_another_burst_is_recovery() {
+        let drive = |found: usize, arm: &str, burst: usize| Act::Drive {
+            found,
+            arm: arm.into(),
+            aim: Point::new(1.0, 2.0, 3.0),
+            burst,
+        };
+        let intent = |act: Act| Event::Intent { act };
+        let driven = |found: usize, arm: &str, end: DriveEnd| Event::Driven {
+            found,
+            arm: arm.into(),
+            burst: burst(end),
+        };
+        let (a, b) = (drive(0, "a", 0), drive(1, "b", 0));
+        let mut record = UnitRecord::new(1, 0.0);
+        record.apply(0.0, &seen());
+        record.apply(0.0, &intent(a.clone()));
+        record.apply(1.0, &intent(b.clone()));
+        assert_eq!((&record.open, &record.also_open), (&Some(b.clone()), &vec![a]));
+        record.apply(3.0, &driven(0, "a", DriveEnd::CamOut));
+        assert_eq!((&record.open, record.also_open.len()), (&Some(b), 0));
+        record.apply(3.0, &intent(drive(0, "a", 1)));
+        record.apply(4.0, &driven(1, "b", DriveEnd::Removed));
+        assert_eq!(record.open, Some(drive(0, "a", 1)));
+        record.apply(6.0, &driven(0, "a", DriveEnd::Removed));
+        assert_eq!((&record.open, record.also_open.len()), (&None, 0));
+        // what is spent on the second burst of a screw is recovery
+        assert_eq!((record.times.screws_s, record.times.recovery_s), (4.0, 2.0));
+        assert_eq!(record.screws_out(), 2);
     }
 
     #[test]

@@ -5,8 +5,8 @@ use crate::device::{
     Arm, ArmState, Bit, CellIo, Clock, DeviceError, DriveEnd, DriveProgram, DriverTool, Motion, RobotArm, TagValue,
     Ticket, jobs, tags,
 };
-use crate::motion::{ArmMotion, Leg, Refusal};
-use crate::plan::{SafeTarget, tool_pose};
+use crate::motion::{ArmMotion, Leg, Refusal, Way};
+use crate::plan::{Room, SafeTarget, tool_pose};
 use crate::record::Burst;
 use geometry::{Base, Direction, Point, Tool, Transform};
 use std::sync::Arc;
@@ -31,6 +31,8 @@ pub struct Mover<'a> {
     pub io: &'a Arc<dyn CellIo>,
     /// What is around it; without, it is sent to no screw.
     pub motion: Option<&'a ArmMotion>,
+    /// Ways that it may take while the other arm is at work; `None` while that one rests.
+    pub room: Option<&'a Room>,
 }
 
 impl std::fmt::Debug for Mover<'_> {
@@ -119,6 +121,8 @@ impl Mover<'_> {
         if self.io.read(&tag).await? == wanted {
             return Ok(());
         }
+        // the job leads straight to the magazine: from the rest that is free
+        self.home().await?;
         self.job(&jobs::mount(bit)).await?;
         match self.io.read(&tag).await? {
             now if now == wanted => Ok(()),
@@ -129,8 +133,8 @@ impl Mover<'_> {
         }
     }
 
-    /// Poses on the way to in front of a target, itself the last. Where no way is free from where the arm stands, it goes home first:
-    /// from there the target was planned.
+    /// Poses on the way to in front of a target, itself the last. Where no way is free from where the arm stands, or only
+    /// one that was not planned beside the other arm's, it goes home first: from there the target was planned.
     async fn way(&self, joints_rad: [f64; 6], target: &SafeTarget) -> Result<Vec<Transform<Base, Tool>>, DeviceError> {
         let refused = |reason: String| DeviceError::Refused {
             device: self.robot().name().into(),
@@ -139,15 +143,22 @@ impl Mover<'_> {
         let motion = self
             .motion
             .ok_or_else(|| refused("what is around it is not drawn".into()))?;
+        let planned = |way: &Way| self.room.is_none_or(|room| room.holds(way));
         let way = match target.check(motion, joints_rad, &self.approach) {
-            Err(Refusal::Collision { leg: Leg::Joint, .. }) => {
+            Ok(way) if planned(&way) => Ok(way),
+            Ok(_) | Err(Refusal::Collision { leg: Leg::Joint, .. }) => {
                 self.home().await?;
                 target.check(motion, self.ready().await?.joints_rad, &self.approach)
             }
-            checked => checked,
+            Err(refusal) => Err(refusal),
         };
-        way.map(|way| way.joint.iter().map(|leg| leg.to).collect())
-            .map_err(|why| refused(why.to_string()))
+        let way = way.map_err(|why| refused(why.to_string()))?;
+        if !planned(&way) {
+            return Err(refused(
+                "the way there is not the one that leaves the other arm its room".into(),
+            ));
+        }
+        Ok(way.joint.iter().map(|leg| leg.to).collect())
     }
 
     /// From in front of the screw: in, and drive.
@@ -200,25 +211,59 @@ impl Mover<'_> {
     /// # Errors
     /// What the arm says; after a time-out, only if the arm does not come to rest in order.
     pub async fn job(&self, job: &str) -> Result<(), DeviceError> {
-        match self.robot().run_job(job).await {
-            Ok(ticket) => self.arrive(ticket, None).await,
-            Err(lost @ DeviceError::Timeout { .. }) => self.settle(lost, None).await,
-            Err(error) => Err(error),
-        }
+        let started = self.start(job).await?;
+        self.finish(started, job).await
     }
 
-    /// Sends the arm out of the way of table and camera, by way of a place farther back where straight home is not free.
+    /// Sends the arm out of the way of table and camera, by way of a place farther back where straight home is not free. One that rests there
+    /// already is left alone.
     ///
     /// # Errors
     /// As for [`job`](Self::job).
     pub async fn home(&self) -> Result<(), DeviceError> {
         if let Some(motion) = self.motion {
-            let joints_rad = self.robot().state().await?.joints_rad;
-            if let Some(via) = motion.via_home(joints_rad) {
+            let state = self.robot().state().await?;
+            if motion.is_home(state.joints_rad) && !state.running && trouble(&state).is_none() {
+                return Ok(());
+            }
+            if let Some(via) = motion.via_home(state.joints_rad) {
                 self.go(via, Motion::Joint).await?;
             }
         }
         self.job(jobs::HOME).await
+    }
+
+    /// Starts a job of the controller without waiting for its end, see [`finish`](Self::finish).
+    ///
+    /// # Returns
+    /// `None` if the answer was lost: the job may be running, its end is found out by reading.
+    ///
+    /// # Errors
+    /// What the arm says.
+    pub async fn start(&self, job: &str) -> Result<Option<Ticket>, DeviceError> {
+        match self.robot().run_job(job).await {
+            Ok(ticket) => Ok(Some(ticket)),
+            Err(DeviceError::Timeout { .. }) => Ok(None),
+            Err(error) => Err(error),
+        }
+    }
+
+    /// Waits for the end of a job that was started.
+    ///
+    /// # Errors
+    /// As for [`job`](Self::job).
+    pub async fn finish(&self, ticket: Option<Ticket>, job: &str) -> Result<(), DeviceError> {
+        match ticket {
+            Some(ticket) => self.arrive(ticket, None).await,
+            None => {
+                let lost = DeviceError::Timeout {
+                    device: self.robot().name().into(),
+                    action: job.into(),
+                    timeout_s: self.timeouts.job_s,
+                };
+                self.settle(lost, None).await
+            }
+        }
     }
 
     async fn arrive(&self, ticket: Ticket, pose: Option<Transform<Base, Tool>>) -> Result<(), DeviceError> {

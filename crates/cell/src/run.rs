@@ -4,15 +4,16 @@
 //! ([`UnitRecord`]), so that going on after a crash and going on after a step are the same thing.
 
 mod climb;
+mod face;
 
 use crate::capture::{Shot, present, region_around, regions_around, shoot};
 use crate::config::CellConfig;
-use crate::device::{DeviceError, Devices, DriveEnd, DriveProgram, TagValue, jobs, tags};
+use crate::device::{DeviceError, Devices, DriveEnd, DriveProgram, TagValue, Ticket, jobs, tags};
 use crate::frames::KeptFrame;
 use crate::journal::{Journal, JournalError};
-use crate::ladder::Cause;
+use crate::ladder::{Cause, Climb};
 use crate::look::{self, Judge, Question};
-use crate::motion::ArmMotion;
+use crate::motion::{ArmMotion, Trajectory};
 use crate::packml::{Command, Illegal, Machine, State};
 use crate::plan::{self, Reach, SafeTarget, Target};
 use crate::program::{FaceId, Program, Step, Work};
@@ -295,6 +296,7 @@ impl Runner {
             record: UnitRecord::new(unit, since_s),
             runner: self,
             observer,
+            laying: None,
         };
         // the time of waiting ends with the loading switch, whatever reading the plate takes
         way.log_at(loaded_s, Event::Arrived)?;
@@ -324,6 +326,7 @@ impl Runner {
             record,
             runner: self,
             observer,
+            laying: None,
         };
         way.log(Event::Resumed)?;
         let loaded = way.runner.devices.io.read(tags::LOADED).await;
@@ -366,6 +369,8 @@ struct Way<'a> {
     runner: &'a mut Runner,
     record: UnitRecord,
     observer: &'a dyn Observer,
+    /// The arm that lays a cover aside, with the job that it was given.
+    laying: Option<(usize, Option<Ticket>)>,
 }
 
 impl Way<'_> {
@@ -392,6 +397,7 @@ impl Way<'_> {
             clock: &runner.devices.clock,
             io: &runner.devices.io,
             motion: runner.motions.get(arm).and_then(Option::as_ref),
+            room: None,
         })
     }
 
@@ -542,7 +548,8 @@ impl Way<'_> {
         }
         self.home().await?;
         let Some(Act::Pull { cover }) = self.record.open.clone() else {
-            return self.lay_aside().await;
+            self.lay_aside().await?;
+            return self.laid_aside().await;
         };
         let index = self.record.steps_done;
         let program = self.runner.program.clone();
@@ -561,6 +568,7 @@ impl Way<'_> {
             (end, SeenBy::Picture, frame.map(Box::new))
         };
         self.lay_aside().await?;
+        self.laid_aside().await?;
         self.log(Event::Pulled {
             cover: CoverRecord {
                 step: index,
@@ -586,15 +594,49 @@ impl Way<'_> {
         Ok((look::cover_off(&shot.frame, before), self.keep(&shot)?))
     }
 
-    /// Sends the arms out of the way of table and camera.
+    /// Sends the arms out of the way of table and camera, one after the other. Where several are away from their rests, as after a stop in the
+    /// middle of their ways, one goes first whose way home is clear of where the others stand; if there is none, a person has to move one.
     async fn home(&mut self) -> Result<(), Stop> {
         self.gate().await?;
-        for arm in 0..self.runner.devices.arms.len() {
+        let laying = self.laying.map(|(arm, _)| arm);
+        let mut away: Vec<(usize, [f64; 6])> = Vec::new();
+        for arm in (0..self.runner.devices.arms.len()).filter(|arm| laying != Some(*arm)) {
+            let state = self.runner.devices.arms[arm].robot.state().await?;
+            let motion = self.runner.motions.get(arm).and_then(Option::as_ref);
+            if state.running || motion.is_none_or(|motion| !motion.is_home(state.joints_rad)) {
+                away.push((arm, state.joints_rad));
+            }
+        }
+        while !away.is_empty() {
+            let Some(next) = (0..away.len()).find(|k| self.may_go_home(*k, &away)) else {
+                return Err(Stop::Device(DeviceError::NotReady {
+                    device: self.runner.devices.arms[away[0].0].robot.name().to_owned(),
+                    state:
+                        "away from its rest, and so is another arm that is in its way home; move one of them by hand"
+                            .into(),
+                }));
+            };
+            let (arm, _) = away.remove(next);
             if let Some(mover) = self.mover(arm) {
                 mover.home().await?;
             }
         }
         Ok(())
+    }
+
+    /// True if an arm's way home keeps the margin from where the others stand that are away from their rests.
+    fn may_go_home(&self, number: usize, away: &[(usize, [f64; 6])]) -> bool {
+        let motion = |arm: usize| self.runner.motions.get(arm).and_then(Option::as_ref);
+        let (arm, joints_rad) = away[number];
+        let others = away.iter().filter(|(other, _)| *other != arm);
+        // of one that is not drawn nothing is known; it carries no driver
+        let Some(own) = motion(arm) else { return true };
+        let way = own.swept(&own.way_home(joints_rad));
+        let margin_mm = self.runner.config.motion.margin_mm;
+        let stands = |at: &[f64; 6]| Trajectory::joint(*at, *at);
+        others
+            .map(|(other, at)| motion(*other).map(|other| other.swept([&stands(at)])))
+            .all(|there| there.is_none_or(|there| way.is_clear_of(&there, margin_mm)))
     }
 
     async fn turn(&mut self, face: &FaceId) -> Result<(), Stop> {
@@ -613,6 +655,7 @@ impl Way<'_> {
     ) -> Result<(Shot, Vec<Target>), Stop> {
         self.home().await?;
         self.turn(face).await?;
+        self.laid_aside().await?;
         let config = self.runner.config.clone();
         let shot = shoot(&self.runner.devices, None, config.inspection.depth_frames).await?;
         let clicks = if purpose == Purpose::Clicked {
@@ -716,15 +759,7 @@ impl Way<'_> {
             }
             other => other?,
         };
-        let count = targets.len();
-        for (number, target) in targets.iter().enumerate() {
-            self.observer.screw(number, count);
-            // an arm comes to a face that no other one stands at
-            if number > 0 && targets[number - 1].place.arm() != target.place.arm() {
-                self.home().await?;
-            }
-            self.remove(target, &shot).await?;
-        }
+        self.drive_out(&targets, &shot).await?;
         self.verify(&targets, &shot).await?;
         self.home().await?;
         Ok(self.record.faces.last().map_or(0, FaceRecord::removed))
@@ -737,44 +772,21 @@ impl Way<'_> {
         program: DriveProgram,
         second_look: Option<PictureId>,
     ) -> Result<Option<DriveEnd>, Stop> {
-        let Some(arm) = self
-            .runner
-            .devices
-            .arms
-            .get(place.arm())
-            .map(|arm| arm.robot.name().to_owned())
-        else {
-            return Ok(None);
-        };
-        let done = self
-            .record
-            .faces
-            .last()
-            .and_then(|f| f.attempts.iter().find(|a| a.found == found));
-        let burst = done.map_or(0, |a| a.bursts.len());
-        self.begin(Act::Drive {
+        let target = Target {
             found,
-            arm: arm.clone(),
-            aim: place.tip(),
-            burst,
-        })
-        .await?;
+            place,
+            room: None,
+        };
+        self.begin_burst(&target).await?;
         let Some(mover) = self.mover(place.arm()) else {
             return Ok(None);
         };
         let mut burst = mover.burst(&place, program).await;
         burst.second_look = second_look;
-        let (end, error) = (burst.end, burst.error.clone());
-        self.log(Event::Driven { found, arm, burst })?;
-        if let Some(error) = error {
-            self.observer.note(&error);
-            // an arm that does not stand ready again is a matter for a person, not for the next screw
-            if let Some(mover) = self.mover(place.arm())
-                && mover.ready().await.is_err()
-            {
-                mover.recover().await?;
-                mover.withdraw(&place).await?;
-            }
+        let (end, failed) = (burst.end, burst.error.is_some());
+        self.end_burst(&target, burst)?;
+        if failed && self.is_in_trouble(&target).await {
+            self.put_right(&target).await?;
         }
         Ok(end)
     }
@@ -854,7 +866,8 @@ impl Way<'_> {
                 .and_then(|f| f.attempts.iter().find(|a| a.found == found));
             let retried = tried.is_some_and(|a| a.retries() > 0);
             if let Some(target) = targets.iter().find(|t| t.found == found && !retried) {
-                self.climb(target, shot, Cause::StillThere).await?;
+                let ladder = self.runner.config.ladder.clone();
+                self.climb(target, shot, Climb::new(&ladder), Cause::StillThere).await?;
                 again = true;
             }
         }
@@ -1022,8 +1035,11 @@ impl Way<'_> {
             return Ok(PullEnd::Stuck);
         };
         self.home().await?;
-        self.lay_aside().await?;
+        if self.laying.is_none() {
+            self.lay_aside().await?; // what the gripper may not hold any more
+        }
         self.turn(&step.present).await?;
+        self.laid_aside().await?;
         let begin_s = self.now_s();
         self.begin(Act::Pull { cover: cover.clone() }).await?;
         let arm = self.runner.devices.arms.iter().position(|arm| arm.robot.name() == by);
@@ -1050,8 +1066,10 @@ impl Way<'_> {
         Ok(end)
     }
 
-    /// Lays the cover aside that the gripper holds, if it holds one.
+    /// Begins to lay the cover aside that the gripper holds, if it holds one. The table may turn and a unit may leave meanwhile; a picture, a
+    /// screw and another pull wait for [`laid_aside`](Self::laid_aside).
     async fn lay_aside(&mut self) -> Result<(), Stop> {
+        self.laid_aside().await?;
         let io = &self.runner.devices.io;
         if io.read(tags::GRIPPER_HOLDING).await? != TagValue::Bool(true) {
             return Ok(());
@@ -1064,8 +1082,20 @@ impl Way<'_> {
         let arm = pullers
             .filter_map(|by| arms.iter().position(|arm| arm.robot.name() == by))
             .next();
-        if let Some(mover) = arm.and_then(|arm| self.mover(arm)) {
-            mover.job(jobs::DROP).await?;
+        if let Some((arm, mover)) = arm.and_then(|arm| Some((arm, self.mover(arm)?))) {
+            let ticket = mover.start(jobs::DROP).await?;
+            self.laying = Some((arm, ticket));
+        }
+        Ok(())
+    }
+
+    /// Waits until a cover is laid aside, if one is being laid.
+    async fn laid_aside(&mut self) -> Result<(), Stop> {
+        let Some((arm, ticket)) = self.laying.take() else {
+            return Ok(());
+        };
+        if let Some(mover) = self.mover(arm) {
+            mover.finish(ticket, jobs::DROP).await?;
         }
         Ok(self.log(Event::LaidAside)?)
     }
@@ -1077,19 +1107,22 @@ impl Way<'_> {
             }
         }
         self.home().await?;
-        self.lay_aside().await?;
+        if self.laying.is_none() {
+            self.lay_aside().await?;
+        }
         let loaded = TagValue::Bool(true);
         // asked before it is ordered: after a crash the unit may have left already
         if self.runner.devices.io.read(tags::LOADED).await? != loaded {
-            return Ok(());
+            return self.laid_aside().await;
         }
         self.begin(Act::Discharge).await?;
-        let io = &self.runner.devices.io;
+        let io = self.runner.devices.io.clone();
         io.write(tags::MAGNET, TagValue::Bool(false)).await?;
         match io.write(tags::DISCHARGE, TagValue::Bool(true)).await {
             Ok(()) | Err(DeviceError::Timeout { .. }) => {}
             Err(error) => return Err(error.into()),
         }
+        self.laid_aside().await?;
         let gone = TagValue::Bool(false);
         match io
             .wait_for(tags::LOADED, gone.clone(), self.runner.config.timeouts.discharge_s)

@@ -3,10 +3,10 @@
 use crate::draw::mix;
 use crate::faults::Fault;
 use crate::mechanics::{ArmErrors, Body};
-use crate::world::{ArmJob, Shared, World, lock};
+use crate::world::{ArmJob, Shared, World, lock, until};
 use async_trait::async_trait;
 use cell::device::{ArmMode, ArmState, Bit, DeviceError, Motion, RobotArm, Ticket, jobs};
-use cell::motion::{Gp25, HOME_RAD, Trajectory};
+use cell::motion::{Gp25, Trajectory};
 use geometry::{Base, Camera, Flange, Tool, Transform};
 
 /// Round trip to the controller, s.
@@ -28,6 +28,8 @@ pub(crate) struct SimArm {
     /// Where the camera really is in this arm's base.
     pub(crate) base_from_camera: Transform<Base, Camera>,
     pub(crate) gripper: bool,
+    /// Where its job HOME ends.
+    home_rad: [f64; 6],
     pub(crate) jig: bool,
     /// What the driver carries.
     pub(crate) bit: Bit,
@@ -61,6 +63,7 @@ impl SimArm {
         tool: Transform<Flange, Tool>,
         base_from_camera: Transform<Base, Camera>,
         gripper: bool,
+        home_rad: [f64; 6],
     ) -> Self {
         Self {
             name: name.into(),
@@ -68,9 +71,10 @@ impl SimArm {
             body: Body::sample(mix(seed, &[name.len() as u64]), errors, tool),
             base_from_camera,
             gripper,
+            home_rad,
             jig: false,
             bit: Bit::Cross,
-            joints_rad: HOME_RAD,
+            joints_rad: home_rad,
             came_from: [1.0; 6],
             visits: 0,
             motion: None,
@@ -82,7 +86,7 @@ impl SimArm {
     }
 
     /// Encoder angles at a time.
-    fn joints_at(&self, now_s: f64) -> [f64; 6] {
+    pub(crate) fn joints_at(&self, now_s: f64) -> [f64; 6] {
         match &self.motion {
             None => self.joints_rad,
             Some(m) => {
@@ -111,8 +115,7 @@ impl SimArm {
         let m = self.motion.clone()?;
         if let Some(at_s) = m.alarm_at_s {
             if at_s <= now_s {
-                self.stop(at_s, format!("alarm {} ({})", COLLISION.0, COLLISION.1));
-                self.alarm = Some((COLLISION.0, COLLISION.1.into()));
+                self.collide(at_s);
             }
             return None;
         }
@@ -130,6 +133,16 @@ impl SimArm {
         self.motion = None;
         self.ended = Some((m.ticket, None));
         m.job
+    }
+
+    pub(crate) fn is_moving(&self) -> bool {
+        self.motion.is_some()
+    }
+
+    /// It has run into the other arm.
+    pub(crate) fn collide(&mut self, now_s: f64) {
+        self.stop(now_s, format!("alarm {} ({})", COLLISION.0, COLLISION.1));
+        self.alarm = Some((COLLISION.0, COLLISION.1.into()));
     }
 
     fn stop(&mut self, now_s: f64, why: String) {
@@ -267,27 +280,31 @@ impl RobotArm for ArmHandle {
     }
 
     async fn wait(&self, ticket: Ticket, timeout_s: f64) -> Result<ArmState, DeviceError> {
-        let mut world = lock(&self.world);
-        let deadline_s = world.now_s() + timeout_s.max(0.0);
+        let deadline_s = lock(&self.world).now_s() + timeout_s.max(0.0);
         loop {
-            let arm = &world.arms[self.index];
-            if let Some(m) = arm.motion.as_ref().filter(|m| m.ticket == ticket.0) {
-                let end_s = m.alarm_at_s.unwrap_or(m.until_s);
-                if end_s > deadline_s {
-                    world.advance_to(deadline_s);
-                    return Err(self.timeout("wait", timeout_s));
-                }
-                world.advance_to(end_s);
-                continue;
+            let end_s =
+                {
+                    let world = lock(&self.world);
+                    let arm = &world.arms[self.index];
+                    match arm.motion.as_ref().filter(|m| m.ticket == ticket.0) {
+                        Some(m) => m.alarm_at_s.unwrap_or(m.until_s),
+                        None => {
+                            return match &arm.ended {
+                                Some((ended, None)) if *ended == ticket.0 => Ok(arm.state(world.now_s())),
+                                Some((ended, Some(why))) if *ended == ticket.0 => Err(DeviceError::NotReady {
+                                    device: self.name.clone(),
+                                    state: why.clone(),
+                                }),
+                                _ => Err(self
+                                    .refuse(format!("ticket {} is not the last motion's; read the state", ticket.0))),
+                            };
+                        }
+                    }
+                };
+            until(&self.world, end_s.min(deadline_s)).await;
+            if end_s > deadline_s {
+                return Err(self.timeout("wait", timeout_s));
             }
-            return match &arm.ended {
-                Some((ended, None)) if *ended == ticket.0 => Ok(arm.state(world.now_s())),
-                Some((ended, Some(why))) if *ended == ticket.0 => Err(DeviceError::NotReady {
-                    device: self.name.clone(),
-                    state: why.clone(),
-                }),
-                _ => Err(self.refuse(format!("ticket {} is not the last motion's; read the state", ticket.0))),
-            };
         }
     }
 
@@ -297,7 +314,8 @@ impl RobotArm for ArmHandle {
         let now_s = world.now_s();
         let arm = &world.arms[self.index];
         arm.ready()?;
-        let home_s = Gp25::travel_s(arm.joints_at(now_s), HOME_RAD) + SETTLE_S;
+        let home_rad = arm.home_rad;
+        let home_s = Gp25::travel_s(arm.joints_at(now_s), home_rad) + SETTLE_S;
         let (takes_s, work) = if job == jobs::HOME {
             (home_s, None)
         } else if arm.gripper && job == jobs::DROP {
@@ -317,7 +335,7 @@ impl RobotArm for ArmHandle {
                 text: "specified JOB not found".into(),
             });
         };
-        self.start(&mut world, HOME_RAD, takes_s, work, job)
+        self.start(&mut world, home_rad, takes_s, work, job)
     }
 
     async fn hold(&self) -> Result<(), DeviceError> {

@@ -5,7 +5,7 @@
 
 use crate::draw::{draw, mix, signed};
 use crate::faults::Fault;
-use crate::world::{LastShot, Shared, World, lock};
+use crate::world::{LastShot, Shared, World, lock, until};
 use async_trait::async_trait;
 use cell::device::{ColorCamera, ColorFrame, DepthCamera, DepthFrame, DeviceError, Region};
 use geometry::{CameraModel, Tool, Transform};
@@ -172,7 +172,7 @@ impl ColorCamera for ColorHandle {
 
     async fn grab(&self, region: Option<Region>) -> Result<ColorFrame, DeviceError> {
         const NAME: &str = "color camera";
-        let (subject, region, whole_region, t_s, state) = {
+        let (subject, whole_region, t_s, state, until_s) = {
             let mut world = lock(&self.0);
             let whole_region = check(NAME, &world.stated_camera, region)?;
             if world.faults.happens(Fault::CameraTimeout) {
@@ -185,19 +185,18 @@ impl ColorCamera for ColorHandle {
             }
             let subject = subject(&mut world, NAME)?;
             let t_s = world.now_s();
-            let state = seen(&world);
             let takes_s = COLOR_S * share(&world.stated_camera, whole_region);
-            world.pass(takes_s);
-            if world.faults.happens(Fault::CameraDroppedFrame) {
-                return Err(DeviceError::Fault {
-                    device: NAME.into(),
-                    action: "grab".into(),
-                    code: -1011,
-                    text: "incomplete frame: packets lost".into(),
-                });
-            }
-            (subject, region, whole_region, t_s, state)
+            (subject, whole_region, t_s, seen(&world), t_s + takes_s)
         };
+        until(&self.0, until_s).await;
+        if lock(&self.0).faults.happens(Fault::CameraDroppedFrame) {
+            return Err(DeviceError::Fault {
+                device: NAME.into(),
+                action: "grab".into(),
+                code: -1011,
+                text: "incomplete frame: packets lost".into(),
+            });
+        }
         // Rendering takes real time: nobody waits for the world meanwhile.
         let rendered = shoot(&subject, roi(region));
         let image = rendered.color.clone();
@@ -219,21 +218,24 @@ impl ColorCamera for ColorHandle {
 impl DepthCamera for DepthHandle {
     async fn grab(&self, region: Option<Region>) -> Result<DepthFrame, DeviceError> {
         const NAME: &str = "depth camera";
-        let (subject, kept, whole_region, t_s, missing) = {
+        let (subject, whole_region, t_s, state, until_s) = {
             let mut world = lock(&self.0);
             let whole_region = check(NAME, &world.stated_camera, region)?;
             let subject = subject(&mut world, NAME)?;
             let t_s = world.now_s();
-            let state = seen(&world);
             let takes_s = DEPTH_S * share(&world.stated_camera, whole_region);
-            world.pass(takes_s);
+            (subject, whole_region, t_s, seen(&world), t_s + takes_s)
+        };
+        until(&self.0, until_s).await;
+        let (kept, missing) = {
+            let mut world = lock(&self.0);
             let missing = world.faults.happens(Fault::DepthMissing);
             // Taken, not copied: a second depth picture is a new exposure with new noise.
             let kept = world
                 .last_shot
                 .take()
                 .filter(|s| s.state == state && s.region == roi(region));
-            (subject, kept, whole_region, t_s, missing)
+            (kept, missing)
         };
         let mut map = match kept {
             Some(shot) => shot.rendered.depth,

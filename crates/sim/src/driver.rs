@@ -4,12 +4,13 @@ use crate::Assumed;
 use crate::draw::draw;
 use crate::faults::Fault;
 use crate::score::{ActionKind, Aim};
-use crate::world::{Shared, lock};
+use crate::world::{Shared, World, lock, until};
 use async_trait::async_trait;
 use cell::device::{Bit, DeviceError, DriveEnd, DriveProgram, DriveResult, DriverTool};
 use geometry::{Direction, Point};
 use rand::RngExt;
 use rand_pcg::Pcg64Mcg;
+use scene::ScrewId;
 
 /// A screw further away than this is not what the bit was meant for, mm.
 const NEAREST_MM: f64 = 12.0;
@@ -144,7 +145,46 @@ pub(crate) struct DriverHandle {
 #[async_trait]
 impl DriverTool for DriverHandle {
     async fn drive(&self, program: DriveProgram) -> Result<DriveResult, DeviceError> {
+        let (result, met, end_s) = {
+            let mut world = lock(&self.world);
+            let (result, met) = self.meet(&mut world, &program)?;
+            (result, met, world.now_s() + result.time_s)
+        };
+        until(&self.world, end_s).await;
         let mut world = lock(&self.world);
+        let mut impacts_s = 0.0;
+        if let Some((id, met)) = &met {
+            let turns = result.end == DriveEnd::Seized && met.torque_nm <= capacity_nm(&program);
+            impacts_s = if turns { result.time_s } else { 0.0 };
+            world.driven(*id, result.end, impacts_s);
+        }
+        let arm = world.arms[self.arm].name.clone();
+        world.record(ActionKind::Drive {
+            arm,
+            screw: met.as_ref().map(|m| m.0),
+            aim: met.as_ref().map(|m| m.1.aim),
+            end: result.end,
+            impacts_s,
+        });
+        if world.faults.happens(Fault::DriverNoAnswer) {
+            world.pass(1.0);
+            return Err(DeviceError::Timeout {
+                device: self.name.clone(),
+                action: "drive".into(),
+                timeout_s: 1.0,
+            });
+        }
+        Ok(result)
+    }
+}
+
+impl DriverHandle {
+    /// What a programme comes to that is begun now, and at which screw.
+    fn meet(
+        &self,
+        world: &mut World,
+        program: &DriveProgram,
+    ) -> Result<(DriveResult, Option<(ScrewId, Met)>), DeviceError> {
         let numbers = [
             program.axial_force_n,
             program.max_time_s,
@@ -224,7 +264,7 @@ impl DriverTool for DriverHandle {
                 let unit = world.unit.as_ref().map_or(0, |u| u.unit.seed);
                 outcome(
                     met,
-                    &program,
+                    program,
                     &assumed,
                     &mut draw(unit, &[70, u64::from(id.0), u64::from(*attempt)]),
                 )
@@ -237,30 +277,7 @@ impl DriverTool for DriverHandle {
                 stroke_mm: 0.0,
             },
         };
-        world.pass(result.time_s);
-        let mut impacts_s = 0.0;
-        if let Some((id, met, _)) = &met {
-            let turns = result.end == DriveEnd::Seized && met.torque_nm <= capacity_nm(&program);
-            impacts_s = if turns { result.time_s } else { 0.0 };
-            world.driven(*id, result.end, impacts_s);
-        }
-        let arm = world.arms[self.arm].name.clone();
-        world.record(ActionKind::Drive {
-            arm,
-            screw: met.as_ref().map(|m| m.0),
-            aim: met.as_ref().map(|m| m.1.aim),
-            end: result.end,
-            impacts_s,
-        });
-        if world.faults.happens(Fault::DriverNoAnswer) {
-            world.pass(1.0);
-            return Err(DeviceError::Timeout {
-                device: self.name.clone(),
-                action: "drive".into(),
-                timeout_s: 1.0,
-            });
-        }
-        Ok(result)
+        Ok((result, met.map(|(id, met, _)| (id, met))))
     }
 }
 

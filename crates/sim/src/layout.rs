@@ -126,7 +126,7 @@ pub(crate) fn station(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use cell::motion::{ArmMotion, CellDrawing, Gp25, HOME_RAD};
+    use cell::motion::{ArmMotion, CellDrawing, Gp25};
 
     fn arm() -> Gp25 {
         Gp25::new(flange_from_tool())
@@ -162,7 +162,7 @@ mod tests {
         for (index, (name, foot_mm)) in ARMS.into_iter().enumerate() {
             let motion = ArmMotion::new(&drawing, name).expect("a drawn arm");
             assert_eq!(motion.arm().flange_from_tool(), flange_from_tool());
-            assert_eq!((motion.home_rad(), drawing.arms[index].foot_mm), (HOME_RAD, foot_mm));
+            assert_eq!(drawing.arms[index].foot_mm, foot_mm);
         }
         let camera = drawing
             .obstacles

@@ -26,6 +26,8 @@ mod mechanics;
 mod operator;
 mod score;
 #[cfg(test)]
+mod shift;
+#[cfg(test)]
 mod tests;
 mod world;
 
@@ -253,6 +255,12 @@ impl SimulatedCell {
         let mut truth = (*world.truth()?).clone();
         truth.screws.retain(|screw| !world.is_out(screw.id));
         Some(truth)
+    }
+
+    /// Nearest that the arms have come to each other so far, mm; not finite while none has moved. For reports and evaluation, never for
+    /// deciding: arms that touch stop with an alarm, as real ones do.
+    pub fn nearest_arms_mm(&self) -> f64 {
+        lock(&self.world).nearest_arms_mm()
     }
 
     /// What the plant was told: one JSON text a finished unit.

@@ -8,13 +8,16 @@ use crate::log::ActionLog;
 use crate::score::{Action, ActionKind, Score, ScrewScore, UnitScore};
 use crate::{Assumed, SimSettings};
 use cell::device::{Bit, DriveEnd};
+use cell::motion::{ArmMotion, CellDrawing};
 use geometry::{Base, Camera, CameraModel, Face, Point, Tool, Transform};
 use nalgebra::{UnitQuaternion, Vector3};
 use rand::RngExt;
 use scene::{CoverId, FaceId, FaceTruth, FaceView, Rendered, ScrewId, Sensor, Unit, UnitOptions};
 use std::collections::{BTreeMap, BTreeSet};
 use std::f64::consts::TAU;
+use std::pin::Pin;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::task::{Context, Poll};
 
 /// The world as its devices hold it.
 pub(crate) type Shared = Arc<Mutex<World>>;
@@ -24,12 +27,70 @@ pub(crate) fn lock(world: &Shared) -> MutexGuard<'_, World> {
     world.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
+/// Waits until it is so late in the world. Time goes on only once everybody who is at work waits, so that two arms that work at the same
+/// time do so in the world too: what the one does takes none of the other's time.
+pub(crate) fn until(world: &Shared, t_s: f64) -> Until {
+    Until {
+        world: world.clone(),
+        t_s,
+        wait: None,
+        acts_seen: 0,
+    }
+}
+
+/// See [`until`]. All that wait are asked in turn; who finds that nothing has happened since it was asked last lets time pass.
+pub(crate) struct Until {
+    world: Shared,
+    t_s: f64,
+    wait: Option<u64>,
+    acts_seen: u64,
+}
+
+impl Future for Until {
+    type Output = ();
+
+    fn poll(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<()> {
+        let shared = self.world.clone();
+        let mut world = lock(&shared);
+        match self.wait {
+            None if world.t_s < self.t_s => {
+                world.acts += 1;
+                let number = world.acts;
+                world.waits.insert(number, self.t_s);
+                self.wait = Some(number);
+            }
+            Some(_) if world.t_s < self.t_s && world.acts == self.acts_seen => {
+                let next_s = world.waits.values().copied().fold(self.t_s, f64::min);
+                world.advance_to(next_s);
+            }
+            _ => {}
+        }
+        if world.t_s >= self.t_s {
+            world.acts += 1;
+            return Poll::Ready(());
+        }
+        self.acts_seen = world.acts;
+        context.waker().wake_by_ref();
+        Poll::Pending
+    }
+}
+
+impl Drop for Until {
+    fn drop(&mut self) {
+        if let Some(wait) = self.wait {
+            lock(&self.world).waits.remove(&wait);
+        }
+    }
+}
+
 /// Time until a fed unit stands on the table, s.
 const FEED_S: f64 = 14.0;
 /// Time to turn another face to the camera, s.
 const TURN_S: f64 = 3.2;
 /// Time to clear the table, s.
 const DISCHARGE_S: f64 = 10.0;
+/// How often is looked whether moving arms touch each other, s.
+const LOOK_S: f64 = 0.02;
 /// A target may not lie deeper than this behind the sheet, mm: the bit stops at the head.
 const DEEPEST_MM: f64 = 8.0;
 /// Nothing may go below this height above the arm's foot, mm: the table.
@@ -81,6 +142,14 @@ pub(crate) struct LastShot {
 /// Everything physical.
 pub(crate) struct World {
     t_s: f64,
+    /// Counts whatever happens, so that who waits can tell whether anything did.
+    acts: u64,
+    /// Until when is waited for, by number of the wait.
+    waits: BTreeMap<u64, f64>,
+    /// What the arms are, to tell whether they touch each other.
+    bodies: Vec<ArmMotion>,
+    /// Nearest that the arms have come to each other, mm.
+    nearest_arms_mm: f64,
     settings: SimSettings,
     pub(crate) arms: Vec<SimArm>,
     pub(crate) faults: FaultDraws,
@@ -106,16 +175,25 @@ impl World {
         let seed = settings.seed;
         let stated_camera = scene::camera(mix(seed, &[10]));
         let tool = layout::flange_from_tool();
+        let drawing = CellDrawing::default();
         let arms = layout::ARMS
             .iter()
+            .zip(&drawing.arms)
             .enumerate()
-            .map(|(i, (name, _))| {
-                let camera = layout::true_base_from_camera(i, seed);
-                SimArm::new(name, mix(seed, &[20, i as u64]), &settings.arms, tool, camera, i == 1)
+            .map(|(i, ((name, _), drawn))| {
+                let (camera, seed) = (layout::true_base_from_camera(i, seed), mix(seed, &[20, i as u64]));
+                SimArm::new(name, seed, &settings.arms, tool, camera, i == 1, drawn.home_rad)
             })
             .collect();
+        let bodies = layout::ARMS
+            .iter()
+            .filter_map(|(name, _)| ArmMotion::new(&drawing, name));
         Self {
             t_s: 0.0,
+            acts: 0,
+            waits: BTreeMap::new(),
+            bodies: bodies.collect(),
+            nearest_arms_mm: f64::INFINITY,
             faults: FaultDraws::new(mix(seed, &[30]), settings.faults.clone()),
             true_camera: layout::true_camera(&stated_camera, seed),
             stated_camera,
@@ -155,11 +233,38 @@ impl World {
 
     /// Moves on to a time; everything that ends on the way happens in its order.
     pub(crate) fn advance_to(&mut self, t_s: f64) {
-        while let Some(at_s) = self.next_event_s().filter(|at_s| *at_s <= t_s) {
-            self.t_s = self.t_s.max(at_s);
+        self.acts += 1;
+        while self.t_s < t_s {
+            let next_s = self.next_event_s().filter(|at_s| *at_s <= t_s).unwrap_or(t_s);
+            let moving = self.arms.iter().filter(|arm| arm.is_moving()).count();
+            // while nothing moves, nothing comes nearer
+            let step_s = if moving > 0 { LOOK_S } else { f64::INFINITY };
+            self.t_s = next_s.min(self.t_s + step_s).max(self.t_s);
+            if moving > 0 {
+                self.look_at_arms();
+            }
             self.settle();
         }
-        self.t_s = self.t_s.max(t_s);
+        self.settle();
+    }
+
+    /// Two arms that touch each other stop, as real ones would.
+    fn look_at_arms(&mut self) {
+        let (now_s, [a, b]) = (self.t_s, &self.bodies[..]) else {
+            return;
+        };
+        let apart_mm = a.apart_mm(self.arms[0].joints_at(now_s), b, self.arms[1].joints_at(now_s));
+        self.nearest_arms_mm = self.nearest_arms_mm.min(apart_mm);
+        if apart_mm < 0.0 {
+            for arm in &mut self.arms {
+                arm.collide(now_s);
+            }
+        }
+    }
+
+    /// Nearest that the arms have come to each other, mm.
+    pub(crate) fn nearest_arms_mm(&self) -> f64 {
+        self.nearest_arms_mm
     }
 
     /// When something ends by itself next.
@@ -569,7 +674,6 @@ pub fn unit_seed(units_seed: u64, index: u64) -> u64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use cell::motion::{ArmMotion, CellDrawing, HOME_RAD};
     use geometry::Direction;
 
     #[test]
@@ -593,7 +697,7 @@ mod tests {
                             let tip = base_from_face * Point::new(x, y, -screw.placed.height_mm);
                             let inwards = base_from_face * Direction::new(0.0, 0.0, 1.0).expect("a direction");
                             let standoff = cell::plan::tool_pose(tip.moved(inwards, -40.0), inwards);
-                            motion.check(HOME_RAD, standoff, cell::plan::tool_pose(tip, inwards), 150.0)
+                            motion.check(motion.home_rad(), standoff, cell::plan::tool_pose(tip, inwards), 150.0)
                         })
                         .collect();
                     screws += 1;
@@ -609,7 +713,7 @@ mod tests {
         }
         // the lowest of tall units that lean are for the other arm
         assert!(screws > 1000 && by_second * 50 < screws, "{by_second} of {screws}");
-        // from a rest above the table most joint moves would swing the bit through the unit
-        assert!(around * 2 > screws, "{around} of {screws}");
+        // for some a straight joint move would swing the bit through the unit: then the way leads around it
+        assert!(around > 0 && around * 2 < screws, "{around} of {screws}");
     }
 }

@@ -57,6 +57,9 @@ pub struct Args {
     /// Heads may be milled off where product description and plant controller allow it (as `mill = true` in table destructive)
     #[arg(long)]
     mill: bool,
+    /// Arms that take screws out at the same time, 1 or 2 (as `arms` in table work); left out, what the cell file says
+    #[arg(long, value_parser = clap::value_parser!(u8).range(1..=2))]
+    arms: Option<u8>,
     /// Go on with the run in --out, in the middle of a unit if need be
     #[arg(long)]
     resume: bool,
@@ -93,6 +96,9 @@ pub fn run(args: &Args) -> Result<Ended> {
     };
     config.help.click |= args.click;
     config.destructive.mill |= args.mill;
+    if let Some(arms) = args.arms {
+        config.work.arms = arms.into();
+    }
     let detector = args.model.detector()?;
     let Backend::Simulated = config.backend;
     let settings = SimSettings {
@@ -107,9 +113,10 @@ pub fn run(args: &Args) -> Result<Ended> {
     let stop = output::stop_on_ctrl_c();
     let (maps, calibration) = runtime.block_on(calibrated(&settings, &simulated.devices, &config, args, &stop))?;
     let provenance = format!(
-        "{} units of seed {}, cell seed {}, model {}, unscrew {}; a person's clicks {}, milling {}. Simulated: a claim about {}.",
+        "{} units of seed {}, {} arm(s) at the screws, cell seed {}, model {}, unscrew {}; a person's clicks {}, milling {}. Simulated: a claim about {}.",
         args.units,
         args.seed,
+        config.work.arms,
         settings.seed,
         detector.model().id(),
         env!("CARGO_PKG_VERSION"),

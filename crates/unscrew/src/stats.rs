@@ -45,7 +45,8 @@ struct Printed {
     statistics: Statistics,
     #[serde(flatten)]
     actions: Option<Actions>,
-    /// What its screws' scores said of each unit in scope beforehand, under the assumptions of `unscrew simulate`, and what became of it.
+    /// What its screws' scores and the units before it said of each unit in scope beforehand, beginning with the assumptions of `unscrew simulate`,
+    /// and what became of it.
     predictions: Vec<Prediction>,
     /// The trend.
     shifts: Vec<Shift>,
@@ -96,7 +97,7 @@ pub fn run(args: &Args) -> Result<Ended> {
         let n = predictions.len() as f64;
         let square = |p: &Prediction| (p.predicted - f64::from(u8::from(p.finished))).powi(2);
         println!(
-            "predicted  {:.1} % finished unaided, by the scores of their screws; {} of {} were (Brier score {:.2})",
+            "predicted  {:.1} % finished unaided, each by the scores of its screws and the units before it; {} of {} were (Brier score {:.2})",
             100.0 * predictions.iter().map(|p| p.predicted).sum::<f64>() / n,
             predictions.iter().filter(|p| p.finished).count(),
             predictions.len(),

@@ -56,6 +56,11 @@ impl Capsule {
         0.5 * nalgebra::distance(&self.from, &self.to) + self.radius_mm
     }
 
+    /// Clear distance, mm; below zero where they overlap.
+    pub(super) fn apart_mm(&self, other: &Self) -> f64 {
+        distance_segment_segment(&Pose::identity(), &other.line(), &self.line()) - other.radius_mm - self.radius_mm
+    }
+
     fn line(&self) -> Segment {
         Segment::new(vector(&self.from.coords), vector(&self.to.coords))
     }
@@ -109,9 +114,7 @@ impl Solid {
                 let (block, line) = (Cuboid::new(vector(half_mm)), part.line());
                 distance_convex(&Pose::identity(), &block, &line, &mut VoronoiSimplex::new(), towards)
             }
-            Self::Capsule(other) => {
-                distance_segment_segment(&Pose::identity(), &other.line(), &part.line()) - other.radius_mm
-            }
+            Self::Capsule(other) => return part.apart_mm(other),
         };
         apart_mm - part.radius_mm
     }
@@ -126,6 +129,63 @@ impl Solid {
             Self::Capsule(other) => nalgebra::distance(&other.middle(), &part.middle()) - other.ball_mm(),
         };
         apart_mm - part.ball_mm()
+    }
+}
+
+/// The room that an arm takes on a way: its parts at postures so close to each other that in between none is farther from them than half a
+/// step.
+#[derive(Clone, Debug)]
+pub struct Swept {
+    /// By part, then by posture, in the cell's frame.
+    parts: Vec<Vec<Capsule>>,
+    /// Corners of a box around each part on all of the way.
+    boxes: Vec<[Point3<f64>; 2]>,
+    step_mm: f64,
+}
+
+impl Swept {
+    pub(super) fn new(parts: usize, step_mm: f64) -> Self {
+        let nothing = [Point3::from([f64::INFINITY; 3]), Point3::from([f64::NEG_INFINITY; 3])];
+        Self {
+            parts: vec![Vec::new(); parts],
+            boxes: vec![nothing; parts],
+            step_mm,
+        }
+    }
+
+    pub(super) fn add(&mut self, body: Vec<Capsule>) {
+        for ((part, [low, high]), capsule) in self.parts.iter_mut().zip(&mut self.boxes).zip(body) {
+            for end in [&capsule.from, &capsule.to] {
+                for axis in 0..3 {
+                    low[axis] = low[axis].min(end[axis] - capsule.radius_mm);
+                    high[axis] = high[axis].max(end[axis] + capsule.radius_mm);
+                }
+            }
+            part.push(capsule);
+        }
+    }
+
+    /// True if two arms keep this distance, wherever each is on its way, mm.
+    pub fn is_clear_of(&self, other: &Self, margin_mm: f64) -> bool {
+        // each may be half a step from the posture that stands for it
+        let keep_mm = margin_mm + 0.5 * (self.step_mm + other.step_mm);
+        let far = |[low, high]: &[Point3<f64>; 2], [other_low, other_high]: &[Point3<f64>; 2]| {
+            (0..3).any(|axis| low[axis] - other_high[axis] > keep_mm || other_low[axis] - high[axis] > keep_mm)
+        };
+        let near = |(a, b): (usize, usize)| {
+            !far(&self.boxes[a], &other.boxes[b])
+                && self.parts[a].iter().any(|part| {
+                    other.parts[b].iter().any(|obstacle| {
+                        let balls_mm = nalgebra::distance(&part.middle(), &obstacle.middle())
+                            - part.ball_mm()
+                            - obstacle.ball_mm();
+                        balls_mm < keep_mm && part.apart_mm(obstacle) < keep_mm
+                    })
+                })
+        };
+        !(0..self.parts.len())
+            .flat_map(|a| (0..other.parts.len()).map(move |b| (a, b)))
+            .any(near)
     }
 }
 

@@ -89,11 +89,11 @@ impl Default for CellDrawing {
             to_mm,
             radius_mm,
         };
-        let arm = |name: &str, foot_mm| DrawnArm {
+        let arm = |name: &str, foot_mm, home_rad| DrawnArm {
             name: name.into(),
             foot_mm,
             turn_rad: 0.0,
-            home_rad: HOME_RAD,
+            home_rad,
             tip_mm: [0.0, -40.0, 300.0],
             tool: vec![
                 capsule("bit", [0.0, 0.0, -80.0], [0.0, 0.0, -6.0], 6.0),
@@ -113,7 +113,16 @@ impl Default for CellDrawing {
                 face_mm: [900.0, 750.0],
                 depth_mm: 900.0,
             },
-            arms: vec![arm("arm_a", [0.0; 3]), arm("arm_b", [0.0, 700.0, 0.0])],
+            // the bit rests 560 mm beside the middle of the table, 470 mm before the face and 750 mm high, each arm's on its own side: out of the
+            // camera's view and of the other arm's way, and from there most ways lead straight to a face
+            arms: vec![
+                arm("arm_a", [0.0; 3], [-1.249, -0.226, -1.122, 1.316, 1.372, -0.65]),
+                arm(
+                    "arm_b",
+                    [0.0, 700.0, 0.0],
+                    [-0.733, -1.167, -1.479, 1.242, 0.785, -1.122],
+                ),
+            ],
             obstacles: vec![
                 block("floor", [800.0, 350.0, -50.0], [5000.0, 4000.0, 100.0]),
                 block("table", [1500.0, 0.0, 45.0], [1000.0, 1000.0, 90.0]),

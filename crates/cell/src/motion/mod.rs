@@ -27,6 +27,7 @@ mod gp25;
 mod profile;
 mod trajectory;
 
+pub use collision::Swept;
 pub use drawing::{CellDrawing, DrawnArm, DrawnBox, DrawnCapsule, DrawnUnit};
 pub use gp25::{
     A1_MM, A2_MM, C1_MM, C2_MM, C3_MM, C4_MM, Gp25, HOME_RAD, Links, Unreachable, model_angles, within_limits,
@@ -61,6 +62,8 @@ const VIA_MM: [[f64; 2]; 10] = [
 const FACE_AHEAD_MM: f64 = 5.0;
 /// Joints this near to their rest are there, rad.
 const AT_HOME_RAD: f64 = 1e-3;
+/// Way of any part between two postures that stand for the room that an arm sweeps, mm.
+const SWEPT_STEP_MM: f64 = 30.0;
 /// Number of the bit among the parts of arm and tool.
 const BIT: usize = PARTS.len();
 
@@ -177,6 +180,8 @@ pub struct ArmMotion {
     unit: UnitSpace,
     /// How far any part of the arm can be from each joint's axis, mm.
     levers_mm: [f64; 6],
+    cell_from_base: Isometry3<f64>,
+    is_right: Option<bool>,
 }
 
 /// The space that the unit may take, but for where its front is.
@@ -233,6 +238,8 @@ impl ArmMotion {
             tool,
             obstacles: still.chain(neighbours).collect(),
             own_foot: Solid::Capsule(foot()),
+            cell_from_base: cell_from_base(own),
+            is_right: is_right(drawing, own),
             unit: UnitSpace {
                 middle: base_from_cell * Point3::from(drawing.unit.middle_mm),
                 half_mm: 0.5 * Vector3::new(height_mm, width_mm, drawing.unit.depth_mm),
@@ -280,7 +287,7 @@ impl ArmMotion {
 
     /// Where to go by way of from in front of a face to the rest; `None` if straight there is free, or no way is known to be.
     pub fn via_home(&self, from_rad: [f64; 6]) -> Option<Transform<Base, Tool>> {
-        if (0..6).all(|j| (from_rad[j] - self.home_rad[j]).abs() < AT_HOME_RAD) {
+        if self.is_home(from_rad) {
             return None;
         }
         let here = self.arm.forward(from_rad);
@@ -288,6 +295,61 @@ impl ArmMotion {
         // a way is as free backwards
         let moves = self.joint_way(self.home_rad, from_rad, here, &self.unit.behind(&face));
         moves.ok().and_then(|moves| via(&moves))
+    }
+
+    /// Clear distance between two arms, mm; below zero where they touch.
+    ///
+    /// # Arguments
+    /// * `joints_rad`, `other_rad` – where their joints are.
+    pub fn apart_mm(&self, joints_rad: [f64; 6], other: &ArmMotion, other_rad: [f64; 6]) -> f64 {
+        let (own, other) = (self.body(joints_rad), other.body(other_rad));
+        let pairs = own.iter().flat_map(|a| other.iter().map(move |b| a.apart_mm(b)));
+        pairs.fold(f64::INFINITY, f64::min)
+    }
+
+    /// Everything of the arm but its foot, in the cell's frame.
+    fn body(&self, joints_rad: [f64; 6]) -> Vec<Capsule> {
+        let (arm, flange) = parts(joints_rad);
+        let tool = self.tool.iter().map(|(_, part)| part.moved(&flange));
+        arm.into_iter()
+            .chain(tool)
+            .map(|c| c.moved(&self.cell_from_base))
+            .collect()
+    }
+
+    /// The room that the arm takes on its way, wherever it is on it.
+    pub fn swept<'a>(&self, ways: impl IntoIterator<Item = &'a Trajectory>) -> Swept {
+        let mut swept = Swept::new(self.tool.len() + PARTS.len(), SWEPT_STEP_MM);
+        for way in ways {
+            let turns = way.steepest_rad();
+            let travel_mm: f64 = turns.iter().zip(self.levers_mm).map(|(turn, lever)| turn * lever).sum();
+            let steps = (travel_mm / SWEPT_STEP_MM).ceil().max(1.0);
+            for step in 0..=steps as usize {
+                swept.add(self.body(way.along(step as f64 / steps)));
+            }
+        }
+        swept
+    }
+
+    /// True if the arm stands on the right of its neighbour; `None` where there are not two.
+    pub fn is_right(&self) -> Option<bool> {
+        self.is_right
+    }
+
+    /// Joint moves from in front of a face to the rest, the way that [`via_home`](Self::via_home) leads.
+    pub fn way_home(&self, from_rad: [f64; 6]) -> Vec<Trajectory> {
+        match self.via_home(from_rad).and_then(|via| self.arm.inverse(via).ok()) {
+            Some(via_rad) => vec![
+                Trajectory::joint(from_rad, via_rad),
+                Trajectory::joint(via_rad, self.home_rad),
+            ],
+            None => vec![Trajectory::joint(from_rad, self.home_rad)],
+        }
+    }
+
+    /// True if these are the joint angles of its rest.
+    pub fn is_home(&self, joints_rad: [f64; 6]) -> bool {
+        (0..6).all(|j| (joints_rad[j] - self.home_rad[j]).abs() < AT_HOME_RAD)
     }
 
     /// Joint moves to a pose, by way of another one if need be.
@@ -423,6 +485,12 @@ struct Nearest {
 
 fn cell_from_base(arm: &DrawnArm) -> Isometry3<f64> {
     Isometry3::new(Vector3::from(arm.foot_mm), Vector3::z() * arm.turn_rad)
+}
+
+fn is_right(drawing: &CellDrawing, own: &DrawnArm) -> Option<bool> {
+    let [a, b] = &drawing.arms[..] else { return None };
+    let neighbour = if a.name == own.name { b } else { a };
+    (own.foot_mm[1] != neighbour.foot_mm[1]).then_some(own.foot_mm[1] < neighbour.foot_mm[1])
 }
 
 /// A part of a tool, drawn from the bit's tip, in the flange's frame.
@@ -572,7 +640,9 @@ mod tests {
 
     #[test]
     fn home_is_gone_to_the_way_one_came() {
-        let arm = arm_among(&[]);
+        let mut drawing = CellDrawing::default();
+        drawing.arms[0].home_rad = HOME_RAD;
+        let arm = ArmMotion::new(&drawing, "arm_a").expect("a drawn arm");
         let way = check(&arm, HOME_RAD, [1070.0, -400.0, 200.0]).expect("free");
         let standoff_rad = way.approach.begin_rad();
         assert!(way.via().is_some() && arm.via_home(standoff_rad).is_some());

@@ -9,20 +9,18 @@ use crate::policy::{Case, Choice};
 use crate::record::{Event, Verdict};
 
 impl Way<'_> {
-    /// One screw: a burst, and the ladder of its cause if it does not come out.
-    pub(super) async fn remove(&mut self, target: &Target, shot: &Shot) -> Result<(), Stop> {
+    /// Tries one rung after the other until the screw is out, is not there, or nothing is left. The other arm rests.
+    ///
+    /// # Arguments
+    /// * `climb` – which rungs have been used.
+    pub(super) async fn climb(
+        &mut self,
+        target: &Target,
+        shot: &Shot,
+        mut climb: Climb<'_>,
+        mut cause: Cause,
+    ) -> Result<(), Stop> {
         let first = self.runner.config.drive.first;
-        let end = self.burst(target.found, target.place, first, None).await?;
-        match Cause::of(end) {
-            Some(cause) => self.climb(target, shot, cause).await,
-            None => Ok(()),
-        }
-    }
-
-    /// Tries one rung after the other until the screw is out, is not there, or nothing is left.
-    pub(super) async fn climb(&mut self, target: &Target, shot: &Shot, mut cause: Cause) -> Result<(), Stop> {
-        let (ladder, first) = (self.runner.config.ladder.clone(), self.runner.config.drive.first);
-        let mut climb = Climb::new(&ladder);
         let (found, mut place) = (target.found, target.place);
         self.log(Event::Recovery { on: true })?;
         while let Some(rung) = climb.next(cause, self.bursts(found)) {
@@ -58,7 +56,7 @@ impl Way<'_> {
     }
 
     /// Bursts at a find of the face that is being worked on.
-    fn bursts(&self, found: usize) -> usize {
+    pub(super) fn bursts(&self, found: usize) -> usize {
         let attempts = self.record.faces.last().into_iter().flat_map(|f| &f.attempts);
         attempts.filter(|a| a.found == found).map(|a| a.bursts.len()).sum()
     }

@@ -3,11 +3,12 @@
 //! The dispatcher knows no clock: it keeps the plan's order wherever two tasks need the same thing, and begins everything else as soon as
 //! it may. Real durations differ from planned ones, so the room before the tables is divided into zones with a lock each:
 //!
-//! - an arm takes all zones of its next motion at once, from right to left, or none of them;
-//! - an arm that does not get them goes back to rest, where it holds none, and waits there.
+//! - an arm takes all zones of its next motion at once, or none of them;
+//! - an arm that does not get them waits where it stands while the other one is in motion or at work; otherwise it goes back to rest, where it
+//!   holds none, and waits there.
 //!
-//! Whoever holds a zone is therefore in motion or at work and waits for nobody: no circle of waits can form. What an arm takes reaches
-//! from its own side to its furthest place, so that arms can neither meet nor cross.
+//! Of two arms that hold zones at least one is therefore in motion or at work and waits for nobody: no circle of waits can form. What an arm
+//! takes reaches from its own side to its furthest place, so that arms can neither meet nor cross.
 //!
 //! A screw that does not come out is tried again after the others of its arm; if it stays, the covers that it holds stay too, and whatever
 //! needs them off is dropped. A unit is discharged in any case, once it was loaded.
@@ -17,7 +18,7 @@ use super::task::{Kind, Placed, Problem};
 use std::collections::{BTreeMap, VecDeque};
 
 /// Width of a zone, mm.
-const ZONE_MM: f64 = 50.0;
+const ZONE_MM: f64 = 20.0;
 
 /// One thing to do, for one device.
 #[derive(Clone, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
@@ -131,7 +132,7 @@ enum Until {
 struct ArmState {
     /// Task that it belongs to, until it is back at rest from it.
     task: Option<usize>,
-    /// Across, in whole mm; `None` at rest.
+    /// How far across it reaches from its own side at the screw where it is, the way back included, whole mm; `None` at rest.
     at_mm: Option<i64>,
     /// Screws to do for its task, with attempts so far.
     left: VecDeque<(usize, u8)>,
@@ -151,9 +152,10 @@ pub struct Dispatcher {
     tables: Vec<(Option<usize>, bool)>,
     open: BTreeMap<u32, Work>,
     next_ticket: u32,
+    /// The arm that is asked first.
+    first: usize,
     retries: u8,
-    rest_mm: Vec<i64>,
-    half_clearance_mm: i64,
+    /// Rightmost of all zones, mm.
     right_mm: i64,
     left_in: Vec<(usize, usize)>,
 }
@@ -169,11 +171,10 @@ struct Fixed {
     after_any: Vec<Vec<(usize, Until)>>,
     /// Tasks that need something that it needs too, and whether they stand before it in the plan.
     rivals: Vec<(usize, bool)>,
-    /// Screws by arm, and the places of all screws of the face across, mm.
-    screws: Vec<Vec<usize>>,
-    y_mm: Vec<i64>,
-    /// Arm that pulls, and the strip across that is swept, mm.
-    pull: Option<(usize, i64, i64)>,
+    /// Screws by arm, in their order, and how far across it reaches for each from its own side, the way from rest and back included, mm.
+    screws: Vec<Vec<(usize, i64)>>,
+    /// Arm that pulls, and how far across it reaches, mm.
+    pull: Option<(usize, i64)>,
 }
 
 impl Dispatcher {
@@ -184,14 +185,9 @@ impl Dispatcher {
     pub fn new(problem: &Problem, placed: &[Placed], retries: u8) -> Self {
         let station: &Station = &problem.station;
         let mut tasks: Vec<Option<Fixed>> = vec![None; problem.tasks.len()];
-        let (mut low_mm, mut high_mm) = (f64::INFINITY, f64::NEG_INFINITY);
         for (k, p) in placed.iter().enumerate() {
             let task = &problem.tasks[p.task];
             let mode = &task.modes[p.mode];
-            for used in mode.arms.iter().flatten() {
-                low_mm = low_mm.min(used.strip.low_mm);
-                high_mm = high_mm.max(used.strip.high_mm);
-            }
             let until = |after: &super::After| {
                 let is_look = matches!(problem.tasks[after.task].kind, Kind::Look | Kind::SecondLook);
                 let until = if is_look && after.lag_s > 0.0 {
@@ -214,11 +210,27 @@ impl Dispatcher {
                         .any(|(a, b)| a.is_some() && b.is_some())
             };
             let middle_mm = station.tables_y_mm[task.table];
+            // from its own side, with half of the room that has to stay between two arms
+            let reach_mm = |arm: usize, low_mm: f64, high_mm: f64| {
+                let (half_mm, rest_mm) = (0.5 * station.clearance_mm, station.arms[arm].rest_y_mm);
+                if arm == 0 {
+                    (high_mm.max(rest_mm) + half_mm).ceil() as i64
+                } else {
+                    (low_mm.min(rest_mm) - half_mm).floor() as i64
+                }
+            };
             let pull = mode
                 .arms
                 .iter()
                 .position(Option::is_some)
                 .filter(|_| task.kind == Kind::Cover);
+            let of_arm = |arm: usize| {
+                let stops = mode.stops.iter().filter(|s| s.arm == arm).map(|s| s.screw);
+                let y_mm = |screw: usize| middle_mm + problem.product.faces[task.part].screws_mm[screw][0];
+                stops
+                    .map(|screw| (screw, reach_mm(arm, y_mm(screw), y_mm(screw))))
+                    .collect()
+            };
             tasks[p.task] = Some(Fixed {
                 kind: task.kind,
                 unit: task.unit,
@@ -236,54 +248,81 @@ impl Dispatcher {
                     .filter(|(n, q)| *n != k && needs_same(q))
                     .map(|(n, q)| (q.task, n < k))
                     .collect(),
-                screws: (0..station.arms.len())
-                    .map(|arm| mode.stops.iter().filter(|s| s.arm == arm).map(|s| s.screw).collect())
-                    .collect(),
-                y_mm: match task.kind {
-                    Kind::Screws => problem.product.faces[task.part].screws_mm.iter(),
-                    _ => [].iter(),
-                }
-                .map(|at| (middle_mm + at[0]).round() as i64)
-                .collect(),
+                screws: (0..station.arms.len()).map(of_arm).collect(),
                 pull: pull.map(|arm| {
                     let half_mm = 0.5 * problem.product.covers[task.part].width_mm;
-                    (
-                        arm,
-                        (middle_mm - half_mm).floor() as i64,
-                        (middle_mm + half_mm).ceil() as i64,
-                    )
+                    (arm, reach_mm(arm, middle_mm - half_mm, middle_mm + half_mm))
                 }),
             });
         }
-        let half_mm = 0.5 * station.clearance_mm;
-        let (low_mm, high_mm) = (low_mm - half_mm - ZONE_MM, high_mm + half_mm + ZONE_MM);
-        let zones = if low_mm < high_mm {
-            ((high_mm - low_mm) / ZONE_MM).ceil() as usize + 1
-        } else {
-            1
-        };
         let tasks: Vec<Fixed> = tasks.into_iter().flatten().collect();
+        Self::of(tasks, station.tables_y_mm.len(), station.arms.len(), retries)
+    }
+
+    /// A dispatcher for one face whose screws are known: which arm does which, in which order.
+    ///
+    /// # Arguments
+    /// * `screws` – for the arm on the right and the one on the left: number of each screw, and how far the arm reaches across for it from
+    ///   its own side (on the way there, at it and on the way back), in steps from right to left. Both may be at work where the right one's
+    ///   reach is less than the left one's. `None`: the other arm rests meanwhile.
+    /// * `first` – the arm that may begin if not both can.
+    /// * `retries` – how often a screw is tried again, after the others of its arm.
+    pub fn at_face(screws: [Vec<(usize, Option<usize>)>; 2], first: usize, retries: u8) -> Self {
+        let most = screws
+            .iter()
+            .flatten()
+            .filter_map(|(_, reach)| *reach)
+            .max()
+            .unwrap_or(0);
+        let [right, left] = screws;
+        // a zone for each step
+        let of = |list: Vec<(usize, Option<usize>)>, whole: usize| {
+            let reach =
+                |(screw, reach): (usize, Option<usize>)| (screw, reach.unwrap_or(whole) as i64 * ZONE_MM as i64);
+            list.into_iter().map(reach).collect()
+        };
+        let task = Fixed {
+            kind: Kind::Screws,
+            unit: 0,
+            table: 0,
+            side: None,
+            after: Vec::new(),
+            after_any: Vec::new(),
+            rivals: Vec::new(),
+            screws: vec![of(right, most), of(left, 0)],
+            pull: None,
+        };
+        Self {
+            first,
+            ..Self::of(vec![task], 1, 2, retries)
+        }
+    }
+
+    fn of(tasks: Vec<Fixed>, tables: usize, arms: usize, retries: u8) -> Self {
+        let screws = tasks.iter().flat_map(|t| t.screws.iter().flatten().map(|(_, mm)| *mm));
+        let pulls = tasks.iter().filter_map(|t| t.pull.map(|(_, mm)| mm));
+        let all_mm: Vec<i64> = screws.chain(pulls).collect();
+        let (low_mm, high_mm) = (all_mm.iter().min().copied(), all_mm.iter().max().copied());
+        let (low_mm, high_mm) = (low_mm.unwrap_or(0), high_mm.unwrap_or(0));
         Self {
             progress: vec![Progress::default(); tasks.len()],
             tasks,
-            arms: station
-                .arms
-                .iter()
-                .map(|_| ArmState {
+            arms: vec![
+                ArmState {
                     task: None,
                     at_mm: None,
                     left: VecDeque::new(),
                     busy: false,
-                })
-                .collect(),
-            zones: vec![None; zones],
-            tables: vec![(None, false); station.tables_y_mm.len()],
+                };
+                arms
+            ],
+            zones: vec![None; ((high_mm - low_mm) / ZONE_MM as i64 + 1) as usize],
+            tables: vec![(None, false); tables],
             open: BTreeMap::new(),
             next_ticket: 1,
+            first: 0,
             retries,
-            rest_mm: station.arms.iter().map(|arm| arm.rest_y_mm.round() as i64).collect(),
-            half_clearance_mm: half_mm.ceil() as i64,
-            right_mm: if low_mm.is_finite() { low_mm.floor() as i64 } else { 0 },
+            right_mm: low_mm,
             left_in: Vec::new(),
         }
     }
@@ -313,6 +352,11 @@ impl Dispatcher {
     /// What is under way.
     pub fn open(&self) -> impl Iterator<Item = (u32, &Work)> {
         self.open.iter().map(|(ticket, work)| (*ticket, work))
+    }
+
+    /// True if the screw that is being driven is tried again, after the others of its arm, should this fail.
+    pub fn comes_back(&self, ticket: u32) -> bool {
+        matches!(self.open.get(&ticket), Some(Work::Drive { attempt, .. }) if *attempt < self.retries)
     }
 
     /// Screws that stayed in: number of the task and of the screw.
@@ -357,6 +401,10 @@ impl Dispatcher {
                 attempt,
             } => {
                 self.arms[arm].busy = false;
+                // on the way it may have held more than it needs where it stands
+                if let Some(at_mm) = self.arms[arm].at_mm {
+                    self.take(arm, at_mm);
+                }
                 if !is_done {
                     if attempt < self.retries {
                         self.arms[arm].left.push_back((screw, attempt + 1));
@@ -423,13 +471,14 @@ impl Dispatcher {
         }
     }
 
-    /// Takes everything from the arm's own side to the far end of a stretch, or nothing.
-    fn take(&mut self, arm: usize, low_mm: i64, high_mm: i64) -> bool {
-        let zone = |mm: i64| ((mm - self.right_mm).max(0) as usize / ZONE_MM as usize).min(self.zones.len() - 1);
+    /// Takes everything from the arm's own side to where it reaches, or nothing.
+    fn take(&mut self, arm: usize, reach_mm: i64) -> bool {
+        let last = self.zones.len() - 1;
+        let zone = |mm: i64| (mm - self.right_mm).max(0) as usize / ZONE_MM as usize;
         let range = if arm == 0 {
-            0..=zone(high_mm + self.half_clearance_mm)
+            0..=zone(reach_mm).min(last)
         } else {
-            zone(low_mm - self.half_clearance_mm)..=self.zones.len() - 1
+            zone(reach_mm).min(last)..=last
         };
         if self.zones[range.clone()]
             .iter()
@@ -456,7 +505,8 @@ impl Dispatcher {
     /// One pass over arms and tasks; true if something changed.
     fn advance(&mut self, commands: &mut Vec<Command>) -> bool {
         let mut changed = false;
-        for arm in 0..self.arms.len() {
+        let (first, arms) = (self.first, self.arms.len());
+        for arm in (0..arms).map(|k| (first + k) % arms) {
             changed |= self.move_arm(arm, commands);
         }
         for task in 0..self.tasks.len() {
@@ -474,11 +524,14 @@ impl Dispatcher {
             return false;
         }
         if let Some(&(screw, attempt)) = self.arms[arm].left.front() {
-            let to_mm = self.tasks[task].y_mm[screw];
-            let rest_mm = self.rest_mm[arm];
-            let from_mm = self.arms[arm].at_mm.unwrap_or(rest_mm);
-            // with the way back, so that it is always free
-            if self.take(arm, from_mm.min(to_mm).min(rest_mm), from_mm.max(to_mm).max(rest_mm)) {
+            let of_screw = self.tasks[task].screws[arm].iter().find(|(k, _)| *k == screw);
+            let to_mm = of_screw.map_or(self.right_mm, |(_, mm)| *mm);
+            let reach_mm = match (self.arms[arm].at_mm, arm) {
+                (None, _) => to_mm,
+                (Some(at_mm), 0) => to_mm.max(at_mm),
+                (Some(at_mm), _) => to_mm.min(at_mm),
+            };
+            if self.take(arm, reach_mm) {
                 self.arms[arm].left.pop_front();
                 self.arms[arm].at_mm = Some(to_mm);
                 self.arms[arm].busy = true;
@@ -494,7 +547,10 @@ impl Dispatcher {
                 return true;
             }
         }
-        if self.arms[arm].at_mm.is_some() {
+        // who stands at the face may wait for one that is in motion or at work, which waits for nobody
+        let others_go_on = self.arms.iter().enumerate().any(|(k, other)| k != arm && other.busy);
+        let may_wait = others_go_on && !self.arms[arm].left.is_empty();
+        if self.arms[arm].at_mm.is_some() && !may_wait {
             self.arms[arm].busy = true;
             self.begin(Work::Withdraw { arm }, commands);
             return true;
@@ -599,15 +655,14 @@ impl Dispatcher {
                 }
                 for (arm, screws) in screws.into_iter().enumerate().filter(|(_, screws)| !screws.is_empty()) {
                     self.arms[arm].task = Some(task);
-                    self.arms[arm].left = screws.into_iter().map(|screw| (screw, 0)).collect();
+                    self.arms[arm].left = screws.into_iter().map(|(screw, _)| (screw, 0)).collect();
                 }
             }
             Kind::Cover => {
-                let Some((arm, low_mm, high_mm)) = fixed.pull else {
+                let Some((arm, reach_mm)) = fixed.pull else {
                     return false;
                 };
-                let rest_mm = self.rest_mm[arm];
-                if self.arms[arm].task.is_some() || !self.take(arm, low_mm.min(rest_mm), high_mm.max(rest_mm)) {
+                if self.arms[arm].task.is_some() || !self.take(arm, reach_mm) {
                     return false;
                 }
                 self.arms[arm].task = Some(task);
@@ -668,6 +723,8 @@ mod tests {
     #[derive(Clone, Debug, PartialEq, Eq, Hash)]
     struct Cell {
         dispatcher: Dispatcher,
+        /// Where each arm is across, `None` at rest.
+        at_mm: Vec<Option<i64>>,
         sweeps_mm: Vec<Option<(i64, i64)>>,
         begun: Vec<Work>,
         repeated: bool,
@@ -675,12 +732,17 @@ mod tests {
     }
 
     impl Cell {
-        fn told(&mut self, event: Event, clearance_mm: i64) {
-            let before: Vec<Option<i64>> = self.dispatcher.arms.iter().map(|arm| arm.at_mm).collect();
+        /// Tells it of an event, and notes which strip of the room each arm sweeps by the problem's own places: from where it stands to the
+        /// screw and back to its rest.
+        fn told(&mut self, event: Event, model: &AllOrders) {
+            let before = self.at_mm.clone();
             let commands = self.dispatcher.step(event);
             let under_way: Vec<usize> = self.dispatcher.open.values().filter_map(arm_of).collect();
             for (arm, sweep) in self.sweeps_mm.iter_mut().enumerate() {
                 let at_rest = !under_way.contains(&arm) && self.dispatcher.arms[arm].at_mm.is_none();
+                if at_rest {
+                    self.at_mm[arm] = None;
+                }
                 if at_rest
                     || self
                         .dispatcher
@@ -692,20 +754,25 @@ mod tests {
                 }
             }
             for command in commands {
-                let d = &self.dispatcher;
-                let over = |places: [i64; 2]| Some((places[0].min(places[1]), places[0].max(places[1])));
+                let rest_mm = |arm: usize| model.problem.station.arms[arm].rest_y_mm as i64;
+                let over =
+                    |places: &[i64]| Some((*places.iter().min().expect("one"), *places.iter().max().expect("one")));
                 match command.work {
                     Work::Drive { task, arm, screw, .. } => {
-                        let from = before[arm].unwrap_or(d.rest_mm[arm]);
-                        self.sweeps_mm[arm] = over([from, d.tasks[task].y_mm[screw]]);
+                        let task = &model.problem.tasks[task];
+                        let table_mm = model.problem.station.tables_y_mm[task.table];
+                        let to = (table_mm + model.problem.product.faces[task.part].screws_mm[screw][0]) as i64;
+                        self.sweeps_mm[arm] = over(&[before[arm].unwrap_or(rest_mm(arm)), to, rest_mm(arm)]);
+                        self.at_mm[arm] = Some(to);
                     }
                     Work::Withdraw { arm } => {
-                        let from = d.arms[arm].at_mm.unwrap_or(d.rest_mm[arm]);
-                        self.sweeps_mm[arm] = over([from, d.rest_mm[arm]]);
+                        self.sweeps_mm[arm] = over(&[before[arm].unwrap_or(rest_mm(arm)), rest_mm(arm)]);
                     }
                     Work::Pull { task, arm } => {
-                        let (_, low, high) = d.tasks[task].pull.expect("a cover");
-                        self.sweeps_mm[arm] = Some((low.min(d.rest_mm[arm]), high.max(d.rest_mm[arm])));
+                        let task = &model.problem.tasks[task];
+                        let table_mm = model.problem.station.tables_y_mm[task.table] as i64;
+                        let half_mm = (0.5 * model.problem.product.covers[task.part].width_mm) as i64;
+                        self.sweeps_mm[arm] = over(&[table_mm - half_mm, table_mm + half_mm, rest_mm(arm)]);
                     }
                     _ => {}
                 }
@@ -716,7 +783,7 @@ mod tests {
                 }
             }
             if let [Some((_, right)), Some((left, _))] = self.sweeps_mm[..] {
-                self.meets |= right + clearance_mm > left;
+                self.meets |= right + model.problem.station.clearance_mm as i64 > left;
             }
         }
     }
@@ -733,7 +800,7 @@ mod tests {
     /// Every order in which events can come, and every failure; a turn that fails would be tried for ever.
     struct AllOrders {
         dispatcher: Dispatcher,
-        clearance_mm: i64,
+        problem: Problem,
     }
 
     impl Model for AllOrders {
@@ -742,13 +809,14 @@ mod tests {
 
         fn init_states(&self) -> Vec<Cell> {
             let mut cell = Cell {
+                at_mm: vec![None; self.dispatcher.arms.len()],
                 sweeps_mm: vec![None; self.dispatcher.arms.len()],
                 dispatcher: self.dispatcher.clone(),
                 begun: Vec::new(),
                 repeated: false,
                 meets: false,
             };
-            cell.told(Event::Begin, self.clearance_mm);
+            cell.told(Event::Begin, self);
             vec![cell]
         }
 
@@ -763,7 +831,7 @@ mod tests {
 
         fn next_state(&self, cell: &Cell, event: Event) -> Option<Cell> {
             let mut next = cell.clone();
-            next.told(event, self.clearance_mm);
+            next.told(event, self);
             Some(next)
         }
 
@@ -786,7 +854,7 @@ mod tests {
         let (problem, placed) = problem(text, arms, tables, units);
         let model = AllOrders {
             dispatcher: Dispatcher::new(&problem, &placed, retries),
-            clearance_mm: problem.station.clearance_mm as i64,
+            problem,
         };
         let checker = model.checker().threads(2).spawn_bfs().join();
         checker.assert_properties();
@@ -813,6 +881,140 @@ mod tests {
         "#;
         let states = check_all(text, 2, 2, 2, 0);
         assert!(states > 100, "{states} states");
+    }
+
+    /// One face that two arms share, and where each of them is or goes by its commands.
+    #[derive(Clone, Debug, PartialEq, Eq, Hash)]
+    struct Face {
+        dispatcher: Dispatcher,
+        /// Screws of each arm: where it stands or comes from, and where it goes.
+        at: [Vec<usize>; 2],
+        driven: Vec<(usize, u8)>,
+        meets: bool,
+    }
+
+    /// Every order of events and every failure at a face: reach of each screw by its number.
+    struct AtFace {
+        dispatcher: Dispatcher,
+        reach: [usize; 6],
+    }
+
+    impl AtFace {
+        fn told(&self, face: &mut Face, event: Event) {
+            let ended = match event {
+                Event::Done(ticket) | Event::Failed(ticket) => face.dispatcher.open.get(&ticket).cloned(),
+                Event::Begin => None,
+            };
+            match ended {
+                Some(Work::Drive { arm, screw, .. }) => face.at[arm] = vec![screw],
+                Some(Work::Withdraw { arm }) => face.at[arm].clear(),
+                _ => {}
+            }
+            for command in face.dispatcher.step(event) {
+                if let Work::Drive {
+                    arm, screw, attempt, ..
+                } = command.work
+                {
+                    face.at[arm].push(screw);
+                    face.driven.push((screw, attempt));
+                    face.driven.sort_unstable();
+                }
+            }
+            let [right, left] = [0, 1].map(|arm| face.at[arm].iter().map(|screw| self.reach[*screw]));
+            if let (Some(right), Some(left)) = (right.max(), left.min()) {
+                face.meets |= right >= left;
+            }
+        }
+    }
+
+    impl Model for AtFace {
+        type State = Face;
+        type Action = Event;
+
+        fn init_states(&self) -> Vec<Face> {
+            let mut face = Face {
+                dispatcher: self.dispatcher.clone(),
+                at: [Vec::new(), Vec::new()],
+                driven: Vec::new(),
+                meets: false,
+            };
+            self.told(&mut face, Event::Begin);
+            vec![face]
+        }
+
+        fn actions(&self, face: &Face, actions: &mut Vec<Event>) {
+            for (ticket, work) in face.dispatcher.open() {
+                actions.push(Event::Done(ticket));
+                if matches!(work, Work::Drive { .. }) {
+                    actions.push(Event::Failed(ticket));
+                }
+            }
+        }
+
+        fn next_state(&self, face: &Face, event: Event) -> Option<Face> {
+            let mut next = face.clone();
+            self.told(&mut next, event);
+            Some(next)
+        }
+
+        fn properties(&self) -> Vec<Property<Self>> {
+            vec![
+                Property::always("arms keep apart", |_, face: &Face| !face.meets),
+                Property::always("no burst is begun twice", |_, face: &Face| {
+                    face.driven.windows(2).all(|pair| pair[0] != pair[1])
+                }),
+                Property::always("something is under way, or all is over", |_, face: &Face| {
+                    face.dispatcher.open.is_empty() == face.dispatcher.is_finished()
+                }),
+                Property::always("no screw is left out", |_, face: &Face| {
+                    let all = (0..6).all(|screw| face.driven.contains(&(screw, 0)));
+                    all || !face.dispatcher.is_finished()
+                }),
+                Property::sometimes("both are at work", |_, face: &Face| {
+                    face.at.iter().all(|at| !at.is_empty())
+                }),
+            ]
+        }
+    }
+
+    #[test]
+    fn two_arms_at_a_face_never_wait_for_each_other_in_a_circle() {
+        // the right arm's screws and the left one's, with how far each reaches
+        for reach in [
+            [0, 2, 3, 4, 2, 1],
+            [0, 3, 1, 1, 3, 2],
+            [1, 3, 0, 2, 4, 1],
+            [1, 2, 3, 3, 2, 1],
+        ] {
+            for first in [0, 1] {
+                let of = |screws: std::ops::Range<usize>| screws.map(|k| (k, Some(reach[k]))).collect();
+                let model = AtFace {
+                    dispatcher: Dispatcher::at_face([of(0..3), of(3..6)], first, 1),
+                    reach,
+                };
+                let checker = model.checker().threads(2).spawn_bfs().join();
+                checker.assert_properties();
+                assert!(checker.unique_state_count() > 100, "{}", checker.unique_state_count());
+            }
+        }
+    }
+
+    /// Where nothing is said of the room, one arm does all of its own before the other begins.
+    #[test]
+    fn without_room_one_arm_rests() {
+        let mut dispatcher = Dispatcher::at_face([vec![(0, None), (1, None)], vec![(2, None)]], 1, 0);
+        let mut commands: VecDeque<Command> = dispatcher.step(Event::Begin).into();
+        let mut order = Vec::new();
+        while let Some(command) = commands.pop_front() {
+            assert!(commands.is_empty(), "one at a time: {commands:?}");
+            order.push(match command.work {
+                Work::Drive { screw, .. } => format!("screw {screw}"),
+                Work::Withdraw { arm } => format!("arm {arm} home"),
+                other => format!("{other:?}"),
+            });
+            commands.extend(dispatcher.step(Event::Done(command.ticket)));
+        }
+        assert_eq!(order, ["screw 2", "arm 1 home", "screw 0", "screw 1", "arm 0 home"]);
     }
 
     /// The shipped unit with events in the order of planned times; one screw never comes out.

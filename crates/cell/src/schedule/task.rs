@@ -522,7 +522,8 @@ impl Builder<'_> {
         if let [(a, first), (b, second)] = &able[..] {
             let arms = [(first, tours[0].as_ref()), (second, tours[1].as_ref())];
             let rest_y_mm = [*a, *b].map(|arm| self.station.arms[arm].rest_y_mm);
-            if let Some(shared) = tour::share(arms, &y_mm, rest_y_mm, self.station.clearance_mm) {
+            let apart = tour::strips_apart(&y_mm, rest_y_mm, self.station.clearance_mm);
+            if let Some(shared) = tour::share(arms, &y_mm, &apart) {
                 let [right, left] = &shared.orders;
                 let parts = [
                     (*a, first, right, shared.wait_s[0]),

@@ -23,6 +23,25 @@ impl Costs {
         self.out_s.len()
     }
 
+    /// The same for some of the screws, in this order.
+    pub fn of(&self, screws: &[usize]) -> Self {
+        let pick = |times: &Vec<f64>| screws.iter().map(|k| times[*k]).collect::<Vec<f64>>();
+        Self {
+            between_s: screws.iter().map(|k| pick(&self.between_s[*k])).collect(),
+            out_s: pick(&self.out_s),
+            back_s: pick(&self.back_s),
+            drive_s: self.drive_s,
+        }
+    }
+
+    /// The shortest way through all screws; exact up to [`EXACT_MAX`].
+    pub fn order(&self) -> Vec<usize> {
+        match Tours::new(self) {
+            Some(tours) => tours.order((1 << self.len()) - 1),
+            None => improved(self, &(0..self.len()).collect::<Vec<_>>()),
+        }
+    }
+
     /// Time from rest through these screws and back, s.
     pub fn time_s(&self, order: &[usize]) -> f64 {
         let (Some(&first), Some(&last)) = (order.first(), order.last()) else {
@@ -219,12 +238,15 @@ pub struct Shared {
     pub span_s: f64,
 }
 
-/// A part of an arm's way: from when to when it sweeps which strip.
+/// A part of an arm's way: from which screw to which, the same twice while it is driven; `None`: its rest.
+pub type Stretch = [Option<usize>; 2];
+
+/// When an arm is on a stretch of its way.
 #[derive(Clone, Copy)]
 struct Sweep {
     from_s: f64,
     to_s: f64,
-    strip: Strip,
+    stretch: Stretch,
 }
 
 /// The best division of a face between the arm on the right and the one on the left: each takes what lies on its side of a line across,
@@ -232,12 +254,14 @@ struct Sweep {
 ///
 /// # Arguments
 /// * `y_mm` – places of the screws across.
-/// * `rest_y_mm` – where the arms rest.
+/// * `is_clear` – whether the arm on the right may be on a stretch of its way while the one on the left is on one of its own.
+///
+/// # Returns
+/// `None` with fewer than two screws, or where no division is possible: a screw that an arm cannot do takes it infinitely long.
 pub fn share(
     arms: [(&Costs, Option<&Tours>); 2],
     y_mm: &[f64],
-    rest_y_mm: [f64; 2],
-    clearance_mm: f64,
+    is_clear: &dyn Fn(Stretch, Stretch) -> bool,
 ) -> Option<Shared> {
     let mut by_y: Vec<usize> = (0..y_mm.len()).collect();
     by_y.sort_by(|&a, &b| y_mm[a].total_cmp(&y_mm[b]));
@@ -247,17 +271,12 @@ pub fn share(
         let ways = [0, 1].map(|side| ways(arms[side], sides[side]));
         for (right, left) in ways[0].iter().flat_map(|r| ways[1].iter().map(move |l| (r, l))) {
             let times_s = [arms[0].0.time_s(right), arms[1].0.time_s(left)];
-            if best
-                .as_ref()
-                .is_some_and(|best| times_s[0].max(times_s[1]) >= best.span_s)
-            {
+            let least_s = times_s[0].max(times_s[1]);
+            if !least_s.is_finite() || best.as_ref().is_some_and(|best| least_s >= best.span_s) {
                 continue;
             }
-            let sweeps = [
-                sweeps(arms[0].0, right, y_mm, rest_y_mm[0]),
-                sweeps(arms[1].0, left, y_mm, rest_y_mm[1]),
-            ];
-            for wait_s in waits(&sweeps, clearance_mm) {
+            let sweeps = [sweeps(arms[0].0, right), sweeps(arms[1].0, left)];
+            for wait_s in waits(&sweeps, is_clear) {
                 let span_s = (times_s[0] + wait_s[0]).max(times_s[1] + wait_s[1]);
                 if best.as_ref().is_none_or(|best| span_s < best.span_s) {
                     best = Some(Shared {
@@ -285,36 +304,47 @@ fn ways((costs, tours): (&Costs, Option<&Tours>), side: &[usize]) -> Vec<Vec<usi
     both(shortest).into_iter().chain(both(side.to_vec())).collect()
 }
 
-fn sweeps(costs: &Costs, order: &[usize], y_mm: &[f64], rest_y_mm: f64) -> Vec<Sweep> {
+/// Strips across that two arms sweep may not come nearer than this: the rule of [`share`] where nothing but places across is known.
+///
+/// # Arguments
+/// * `rest_y_mm` – where the arms rest.
+pub fn strips_apart(y_mm: &[f64], rest_y_mm: [f64; 2], clearance_mm: f64) -> impl Fn(Stretch, Stretch) -> bool {
+    move |right, left| {
+        let strip = |stretch: Stretch, rest_mm: f64| Strip::over(stretch.map(|at| at.map_or(rest_mm, |k| y_mm[k])));
+        strip(right, rest_y_mm[0]).is_clear_of(&strip(left, rest_y_mm[1]), clearance_mm)
+    }
+}
+
+fn sweeps(costs: &Costs, order: &[usize]) -> Vec<Sweep> {
     let mut sweeps = Vec::with_capacity(2 * order.len() + 1);
     let mut now_s = 0.0;
-    let mut sweep = |time_s: f64, from_y: f64, to_y: f64| {
+    let mut sweep = |time_s: f64, stretch: Stretch| {
         sweeps.push(Sweep {
             from_s: now_s,
             to_s: now_s + time_s,
-            strip: Strip::over([from_y, to_y]),
+            stretch,
         });
         now_s += time_s;
     };
-    for (k, &screw) in order.iter().enumerate() {
-        match k.checked_sub(1).map(|before| order[before]) {
-            None => sweep(costs.out_s[screw], rest_y_mm, y_mm[screw]),
-            Some(before) => sweep(costs.between_s[before][screw], y_mm[before], y_mm[screw]),
-        }
-        sweep(costs.drive_s, y_mm[screw], y_mm[screw]);
+    let mut last: Option<usize> = None;
+    for &screw in order {
+        let way_s = last.map_or(costs.out_s[screw], |before| costs.between_s[before][screw]);
+        sweep(way_s, [last, Some(screw)]);
+        sweep(costs.drive_s, [Some(screw); 2]);
+        last = Some(screw);
     }
-    if let Some(&last) = order.last() {
-        sweep(costs.back_s[last], y_mm[last], rest_y_mm);
+    if let Some(screw) = last {
+        sweep(costs.back_s[screw], [last, None]);
     }
     sweeps
 }
 
 /// The shortest waits of the one or the other arm that keep them apart all the time.
-fn waits([right, left]: &[Vec<Sweep>; 2], clearance_mm: f64) -> [[f64; 2]; 2] {
+fn waits([right, left]: &[Vec<Sweep>; 2], is_clear: &dyn Fn(Stretch, Stretch) -> bool) -> [[f64; 2]; 2] {
     // how much later the left arm may not begin than the right one: open intervals
     let mut barred: Vec<(f64, f64)> = Vec::new();
     for (r, l) in right.iter().flat_map(|r| left.iter().map(move |l| (r, l))) {
-        if !r.strip.is_clear_of(&l.strip, clearance_mm) {
+        if !is_clear(r.stretch, l.stretch) {
             barred.push((r.from_s - l.to_s, r.to_s - l.from_s));
         }
     }
@@ -411,6 +441,7 @@ mod tests {
             let arms = [(&a, Some(&tours[0])), (&b, Some(&tours[1]))];
             let (shared, rest) = (least_shared_s(arms), [-300.0, 1000.0]);
             let rough = least_shared_s([(&a, None), (&b, None)]);
+            let apart = strips_apart(&y_mm, rest, 250.0);
             let mut best_s = f64::INFINITY;
             for set in 0usize..32 {
                 let part = |bit: usize| (0..5).filter(|k| set >> k & 1 == bit).collect::<Vec<usize>>();
@@ -419,8 +450,8 @@ mod tests {
                     .flat_map(|r| permutations(&part(0)).into_iter().map(move |l| (r.clone(), l)))
                 {
                     let times = [a.time_s(&right), b.time_s(&left)];
-                    let both = [sweeps(&a, &right, &y_mm, rest[0]), sweeps(&b, &left, &y_mm, rest[1])];
-                    for wait in waits(&both, 250.0) {
+                    let both = [sweeps(&a, &right), sweeps(&b, &left)];
+                    for wait in waits(&both, &apart) {
                         best_s = best_s.min((times[0] + wait[0]).max(times[1] + wait[1]));
                     }
                     if set == 31 {
@@ -431,7 +462,7 @@ mod tests {
                     }
                 }
             }
-            let found = share(arms, &y_mm, rest, 250.0).expect("shared");
+            let found = share(arms, &y_mm, &apart).expect("shared");
             assert!(found.span_s >= best_s - 1e-9);
         }
     }
@@ -443,14 +474,15 @@ mod tests {
             let tours = Tours::new(&a).expect("small");
             let arm = (&a, Some(&tours));
             let rest = [-300.0, 1000.0];
-            let Some(found) = share([arm, arm], &y_mm, rest, 300.0) else {
+            let apart = strips_apart(&y_mm, rest, 300.0);
+            let Some(found) = share([arm, arm], &y_mm, &apart) else {
                 continue;
             };
-            let [right, left] = [0, 1].map(|side| sweeps(&a, &found.orders[side], &y_mm, rest[side]));
+            let [right, left] = [0, 1].map(|side| sweeps(&a, &found.orders[side]));
             for (r, l) in right.iter().flat_map(|r| left.iter().map(move |l| (r, l))) {
                 let together = r.from_s + found.wait_s[0] < l.to_s + found.wait_s[1] - 1e-6
                     && l.from_s + found.wait_s[1] < r.to_s + found.wait_s[0] - 1e-6;
-                assert!(!together || r.strip.is_clear_of(&l.strip, 300.0));
+                assert!(!together || apart(r.stretch, l.stretch));
             }
         }
     }
