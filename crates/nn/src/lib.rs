@@ -5,8 +5,9 @@
 //! as safetensors, a [`Network`] reads them and runs them over whole pictures or batches of clips; an [`Engine`] is such a network, or
 //! with the feature `ort` any ONNX graph.
 //!
-//! Everything rests on one register-blocked kernel (AVX-512, AVX2 or portable, found at run time). Results do not depend
-//! on the number of threads nor on how a picture is cut into strips.
+//! Everything rests on one register-blocked kernel (AVX-512, AVX2 or portable, found at run time), and for inference in eight bits
+//! ([`Network::in_eight_bits`]) on a second one of the same build. Results do not depend on the number of threads nor on how a picture is
+//! cut into strips; those in eight bits not on the processor either.
 //!
 //! ```
 //! use nn::{LayerSpec, Spec, Tensor, Trainer, softmax_cross_entropy};
