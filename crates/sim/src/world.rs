@@ -19,6 +19,10 @@ use std::pin::Pin;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::task::{Context, Poll};
 
+/// Half side of the matching window of the cell's stereo, in its pixels: none. Already one of 3 pixels makes heads beside a wall seem to lean
+/// together by several degrees, and the rule that leaves out faces whose heads really do cannot tell the two apart yet.
+const DEPTH_WINDOW_PX: i64 = 0;
+
 /// The world as its devices hold it.
 pub(crate) type Shared = Arc<Mutex<World>>;
 
@@ -511,6 +515,7 @@ impl World {
             scene_seed: mix(loaded.score.seed, &[41, face as u64]),
             sensor: Sensor {
                 noise_seed: mix(self.settings.seed, &[42, self.exposures]),
+                depth_window_px: DEPTH_WINDOW_PX,
                 ..Sensor::sample(mix(loaded.score.seed, &[43]))
             },
             removed_screws: loaded.removed.iter().copied().collect(),

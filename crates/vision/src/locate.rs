@@ -18,9 +18,6 @@ pub const RIM_TERMS: usize = RINGS.len();
 pub(crate) const USUAL_RIM: [f64; RIM_TERMS] = [0.0, 0.0, 0.5, 0.5, 0.0, 0.0, 0.0, 0.02];
 /// Rings that must have depth of their own; the others are filled from their neighbours.
 const RINGS_SEEN: usize = 5;
-/// Share of the ring of sheet that must be one plane for a head's top to tell how the head leans: stereo's window sees a wall beside a head
-/// with it, and the top seems to lean away from it.
-const EVEN_SHEET: f64 = 0.7;
 /// The slope that a face in front of the camera can have: steeper planes come from an edge.
 const STEEPEST: f64 = 1.0;
 /// Stereo errors of neighbouring measurements go together: so many count as one.
@@ -50,7 +47,7 @@ pub struct Located {
     pub sigma_lateral_mm: f64,
     /// Normal of the sheet around it, towards the camera.
     pub normal: Direction<Camera>,
-    /// Normal of the head's top, where it has enough depth of its own and nothing but even sheet around it.
+    /// Normal of the head's top, where it has enough depth of its own.
     pub top_normal: Option<Direction<Camera>>,
     /// What the depth rests on.
     pub source: DepthSource,
@@ -94,12 +91,10 @@ pub fn locate(
         }
     };
     let depth_mm = sheet.depth_mm - height_mm;
-    let all = std::f64::consts::PI * (outer * outer - inner * inner) / f64::from(depth.step * depth.step);
-    let alone = sheet.inliers as f64 >= EVEN_SHEET * all;
     let [inner, outer] = TOP_RING.map(|r| r * diameter_px);
     let top = depth
         .plane_at(pixel, inner, outer)
-        .filter(|plane| alone && believable(plane, camera, pixel));
+        .filter(|plane| believable(plane, camera, pixel));
     Some(Located {
         point: camera.unproject(pixel, depth_mm),
         sigma_depth_mm,
