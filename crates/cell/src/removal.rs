@@ -1,9 +1,9 @@
 //! One screw: approach, drive, retreat; and the moves of the arms, none of which is ever sent twice.
 
-use crate::config::{Approach, Timeouts};
+use crate::config::{Approach, CellConfig, Timeouts};
 use crate::device::{
-    Arm, ArmState, Bit, CellIo, Clock, DeviceError, DriveEnd, DriveProgram, DriverTool, Motion, RobotArm, TagValue,
-    Ticket, jobs, tags,
+    Arm, ArmState, Bit, CellIo, Clock, DeviceError, Devices, DriveEnd, DriveProgram, DriverTool, Motion, RobotArm,
+    TagValue, Ticket, jobs, tags,
 };
 use crate::motion::{ArmMotion, Leg, Refusal, Way};
 use crate::plan::{Room, SafeTarget, tool_pose};
@@ -43,7 +43,26 @@ impl std::fmt::Debug for Mover<'_> {
     }
 }
 
-impl Mover<'_> {
+impl<'a> Mover<'a> {
+    /// That of an arm of a cell; `None` if there is no such arm. `motions` has an entry for each arm whose ways are checked.
+    pub fn of(
+        devices: &'a Devices,
+        config: &CellConfig,
+        motions: &'a [Option<ArmMotion>],
+        arm: usize,
+        room: Option<&'a Room>,
+    ) -> Option<Self> {
+        Some(Self {
+            arm: devices.arms.get(arm)?,
+            approach: config.approach,
+            timeouts: config.timeouts,
+            clock: &devices.clock,
+            io: &devices.io,
+            motion: motions.get(arm).and_then(Option::as_ref),
+            room,
+        })
+    }
+
     fn robot(&self) -> &dyn RobotArm {
         self.arm.robot.as_ref()
     }

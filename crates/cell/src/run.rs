@@ -390,15 +390,7 @@ impl Way<'_> {
 
     fn mover(&self, arm: usize) -> Option<Mover<'_>> {
         let runner = &self.runner;
-        Some(Mover {
-            arm: runner.devices.arms.get(arm)?,
-            approach: runner.config.approach,
-            timeouts: runner.config.timeouts,
-            clock: &runner.devices.clock,
-            io: &runner.devices.io,
-            motion: runner.motions.get(arm).and_then(Option::as_ref),
-            room: None,
-        })
+        Mover::of(&runner.devices, &runner.config, &runner.motions, arm, None)
     }
 
     /// Takes it apart, hands it out, closes its record.

@@ -26,6 +26,18 @@ pub struct ArmErrors {
     pub repeatability_mm: f64,
 }
 
+impl ArmErrors {
+    /// An arm as its data sheet says.
+    pub const NONE: Self = Self {
+        link_mm: 0.0,
+        zero_deg: 0.0,
+        gravity: 0.0,
+        ripple_mm: 0.0,
+        hysteresis_mm: 0.0,
+        repeatability_mm: 0.0,
+    };
+}
+
 impl Default for ArmErrors {
     fn default() -> Self {
         Self {

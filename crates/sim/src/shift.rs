@@ -140,14 +140,7 @@ fn map(world: &Shared, arm: usize) -> Map {
 
 /// Takes units apart; returns their records and how near the arms came to each other, mm.
 fn shift(units: u64, seed: u64, arms: usize) -> (Vec<UnitRecord>, f64) {
-    let none = ArmErrors {
-        link_mm: 0.0,
-        zero_deg: 0.0,
-        gravity: 0.0,
-        ripple_mm: 0.0,
-        hysteresis_mm: 0.0,
-        repeatability_mm: 0.0,
-    };
+    let none = ArmErrors::NONE;
     let mut simulated = SimulatedCell::new(SimSettings {
         units_seed: seed,
         excluded_share: 0.0,

@@ -27,14 +27,7 @@ fn easy() -> SimSettings {
     SimSettings {
         wear: 0.0,
         excluded_share: 0.0,
-        arms: ArmErrors {
-            link_mm: 0.0,
-            zero_deg: 0.0,
-            gravity: 0.0,
-            ripple_mm: 0.0,
-            hysteresis_mm: 0.0,
-            repeatability_mm: 0.0,
-        },
+        arms: ArmErrors::NONE,
         ..SimSettings::default()
     }
 }

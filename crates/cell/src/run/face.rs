@@ -58,15 +58,7 @@ struct Beside<'a> {
 
 impl<'a> Beside<'a> {
     fn mover(&self, arm: usize, room: Option<&'a Room>) -> Option<Mover<'a>> {
-        Some(Mover {
-            arm: self.devices.arms.get(arm)?,
-            approach: self.config.approach,
-            timeouts: self.config.timeouts,
-            clock: &self.devices.clock,
-            io: &self.devices.io,
-            motion: self.motions.get(arm).and_then(Option::as_ref),
-            room,
-        })
+        Mover::of(self.devices, self.config, self.motions, arm, room)
     }
 
     fn burst(&self, ticket: u32, screw: usize, target: &'a Target, program: DriveProgram) -> Option<Pending<'a>> {
