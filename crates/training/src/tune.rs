@@ -88,9 +88,9 @@ pub fn tune(model: &Model, first_seed: u64, faces: u64, done: &dyn Fn(u64)) -> R
                 unfound += 1;
                 continue;
             };
-            scores.push((find.score, true));
+            scores.push(Score::of(find, &shot, true));
             let error = errors(find.pixel, truth.pixel);
-            centers.extend(error.map(|off_px| (off_px, find.sigma_px, find.score)));
+            centers.extend(error.map(|off_px| (off_px, find.sigma_px, scores.len() - 1)));
             let (Some(depth), Some(camera)) = (&shot.frame.depth, &shot.frame.camera) else {
                 continue;
             };
@@ -104,18 +104,22 @@ pub fn tune(model: &Model, first_seed: u64, faces: u64, done: &dyn Fn(u64)) -> R
         for find in found.iter().filter(|s| s.verdict != Verdict::Other) {
             let near = |s: &&scene::ScrewTruth| s.pixel.distance_px(&find.pixel) < 0.5 * s.head_d_px;
             if !shot.truth.screws.iter().any(|s| near(&s)) {
-                scores.push((find.score, false));
+                scores.push(Score::of(find, &shot, false));
             }
         }
     }
     rim_heights(&rims, &mut corrections);
-    corrections.score = calibration(&scores);
-    for (score, _) in &mut scores {
-        *score = corrections.probability(*score);
-    }
-    for (_, _, score) in &mut centers {
-        *score = corrections.probability(*score);
-    }
+    corrections.score = calibration(&scores, corrections.score);
+    let measured: Vec<Score> = scores.iter().copied().filter(|s| s.rise_mm.is_some()).collect();
+    corrections.raised_score = calibration(&measured, corrections.raised_score);
+    let scores: Vec<(f64, bool)> = scores
+        .iter()
+        .map(|s| (corrections.probability(s.said, s.rise_mm), s.real))
+        .collect();
+    let centers: Vec<(f64, f64, f64)> = centers
+        .into_iter()
+        .map(|(off_px, sigma_px, of)| (off_px, sigma_px, scores[of].0))
+        .collect();
     corrections.center_sigma = center_sigma(&centers);
     // with scores that are probabilities, least expected cost is a matter of the costs alone
     let (accept, review) = (1.0 - LOOK / FALSE_FIND, LOOK / MISS);
@@ -188,6 +192,32 @@ fn center_sigma(errors: &[(f64, f64, f64)]) -> [f64; 3] {
     let ratio = |error: &(f64, f64, f64)| error.0 / weights.dot(&terms(error)).exp();
     weights.x += one_sigma(errors.iter().map(ratio).collect()).ln();
     weights.into()
+}
+
+/// What the networks said of a find, and whether they were right.
+#[derive(Clone, Copy)]
+struct Score {
+    said: f64,
+    /// How far it rises above its sheet, mm.
+    rise_mm: Option<f64>,
+    real: bool,
+}
+
+impl Score {
+    fn of(find: &Screw, shot: &Shot, real: bool) -> Self {
+        let space = shot.frame.depth.as_ref().zip(shot.frame.camera.as_ref());
+        let profile = space.and_then(|(depth, camera)| RimProfile::of(depth, camera, find.pixel, find.diameter_px));
+        Self {
+            said: find.score,
+            rise_mm: profile.map(|profile| profile.rise_mm()),
+            real,
+        }
+    }
+
+    fn terms<const N: usize>(&self) -> SVector<f64, N> {
+        let terms = Corrections::score_terms(self.said, self.rise_mm.unwrap_or(0.0));
+        SVector::from_fn(|k, _| terms[k])
+    }
 }
 
 /// A recess rim in the depth of a face.
@@ -343,32 +373,36 @@ fn below_rim(errors: &[CueError]) -> f64 {
     sum(&|e| dot(e.off_px, e.parallax_px)) / square
 }
 
-/// [`Corrections::score`] by which the scores are likeliest, with targets that guard against overconfidence (Platt 1999).
-fn calibration(scores: &[(f64, bool)]) -> [f64; 3] {
-    let start = Vector3::from(Corrections::default().score);
-    let scores: Vec<_> = scores.iter().filter(|s| s.0 >= DOUBTFUL_FROM).collect();
-    let real = scores.iter().filter(|s| s.1).count() as f64;
+/// [`Corrections::score`], or with five terms [`Corrections::raised_score`], by which the scores are likeliest, with targets that guard
+/// against overconfidence (Platt 1999).
+fn calibration<const N: usize>(scores: &[Score], start: [f64; N]) -> [f64; N] {
+    let start = SVector::<f64, N>::from(start);
+    let scores: Vec<_> = scores.iter().filter(|s| s.said >= DOUBTFUL_FROM).collect();
+    let real = scores.iter().filter(|s| s.real).count() as f64;
     let not = scores.len() as f64 - real;
     if real < 10.0 || not < 10.0 {
         return start.into();
     }
     let targets = [1.0 / (not + 2.0), (real + 1.0) / (real + 2.0)];
+    // a little weight on the slopes' staying where they are, none on the constant's
+    let stay = SVector::<f64, N>::from_fn(|k, _| if k == 2 { 1e-6 } else { 0.1 });
     let mut curve = start;
     for _ in 0..100 {
-        // Newton's step on the cross-entropy, with a little weight on the slopes' staying where they are
-        let stay = Vector3::new(0.1, 0.1, 1e-6);
-        let (mut slope, mut bend) = (stay.component_mul(&(curve - start)), Matrix3::from_diagonal(&stay));
-        for &&(score, real) in &scores {
-            let score = score.clamp(1e-7, 1.0 - 1e-7);
-            let terms = Vector3::new(score.ln(), -(1.0 - score).ln(), 1.0);
+        // Newton's step on the cross-entropy
+        let (mut slope, mut bend) = (
+            stay.component_mul(&(curve - start)),
+            SMatrix::<f64, N, N>::from_diagonal(&stay),
+        );
+        for score in &scores {
+            let terms = score.terms::<N>();
             let p = 1.0 / (1.0 + (-terms.dot(&curve)).exp());
-            slope += (p - targets[usize::from(real)]) * terms;
+            slope += (p - targets[usize::from(score.real)]) * terms;
             bend += (p * (1.0 - p)).max(1e-9) * terms * terms.transpose();
         }
         let Some(inverse) = bend.try_inverse() else { break };
         curve -= (inverse * slope).map(|step| step.clamp(-0.5, 0.5));
         // a higher score is never less probable
-        (curve.x, curve.y) = (curve.x.clamp(0.1, 4.0), curve.y.clamp(0.1, 4.0));
+        (curve[0], curve[1]) = (curve[0].clamp(0.1, 4.0), curve[1].clamp(0.1, 4.0));
     }
     curve.into()
 }
@@ -392,27 +426,44 @@ mod tests {
 
     #[test]
     fn calibrated_scores_are_probabilities_and_thresholds_follow_the_costs() {
-        // true odds of what a network says as p: steep where it says no, flat where it says yes
+        // true odds of what a network says as p: steep where it says no, flat where it says yes, and heads rise while marks do not
         let truth = Corrections {
             score: [1.6, 0.7, 0.4],
+            raised_score: [1.6, 0.7, -1.5, 1.9, -0.3],
             ..Corrections::default()
         };
-        let mut scores = Vec::new();
-        for k in 1..80 {
-            let said = f64::from(k) / 80.0;
-            let real = (2000.0 * truth.probability(said)).round() as usize;
-            scores.extend((0..2000).map(|i| (said, i < real)));
-        }
-        let score = calibration(&scores);
+        let samples = |rises_mm: &[Option<f64>]| -> Vec<Score> {
+            let places = (1..80).flat_map(|k| rises_mm.iter().map(move |&rise_mm| (f64::from(k) / 80.0, rise_mm)));
+            let scores = places.flat_map(|(said, rise_mm)| {
+                let real = (2000.0 * truth.probability(said, rise_mm)).round() as usize;
+                (0..2000).map(move |i| Score {
+                    said,
+                    rise_mm,
+                    real: i < real,
+                })
+            });
+            scores.collect()
+        };
+        let (flat, raised) = (samples(&[None]), samples(&[Some(0.0), Some(2.0), Some(3.5)]));
         let found = Corrections {
-            score,
+            score: calibration(&flat, Corrections::default().score),
+            raised_score: calibration(&raised, Corrections::default().raised_score),
             ..Corrections::default()
         };
-        let calibrated: Vec<(f64, bool)> = scores.iter().map(|&(s, real)| (found.probability(s), real)).collect();
-        for (score, _) in &scores {
-            let (is, should) = (found.probability(*score), truth.probability(*score));
-            assert!((is - should).abs() < 0.005, "{score}: {is} for {should}");
+        let scores: Vec<_> = flat.iter().chain(&raised).collect();
+        for score in &scores {
+            let [is, should] = [found, truth].map(|c| c.probability(score.said, score.rise_mm));
+            assert!(
+                (is - should).abs() < 0.01,
+                "{} {:?}: {is} for {should}",
+                score.said,
+                score.rise_mm
+            );
         }
+        let calibrated: Vec<(f64, bool)> = scores
+            .iter()
+            .map(|s| (found.probability(s.said, s.rise_mm), s.real))
+            .collect();
         let (accept, review) = (1.0 - LOOK / FALSE_FIND, LOOK / MISS);
         let best = cost(&calibrated, accept, review);
         for off in [-0.1, 0.1] {

@@ -15,13 +15,15 @@ use crate::center::{Cue, CueCenter, cross, fuse, outer_circle};
 use crate::coarse::{candidates, coarse_map, suppress};
 use crate::fine::{Evidence, look};
 use crate::layout::{CLIP_PX, Class, STRIDE};
-use crate::locate::{facings, locate, parallax_px};
+use crate::locate::{RimProfile, facings, locate, parallax_px};
 use crate::picture::{Level, pyramid_scales};
 use crate::quality::{Doubt, doubts};
 use crate::{Model, ModelError};
 
 /// Two finds nearer than this, in head diameters, are the same fastener.
 const SAME: f64 = 0.5;
+/// Below this probability of a fastener nothing that depth says makes it one.
+const MAY_BE: f32 = 0.01;
 /// So many candidates, screws or not, have a say in where a face looks.
 const ENOUGH_HEADS: usize = 24;
 /// Heads so much smaller or larger than asked for are still reported.
@@ -341,7 +343,10 @@ impl Detector {
         finds.retain(|f| region.contains(f.pixel) && heads.contains(&f.diameter_px));
         let finds = merge(finds);
         let start = Instant::now();
-        let told: Vec<Option<Told>> = finds.iter().map(|find| self.tell(find, options)).collect();
+        let told: Vec<Option<Told>> = finds
+            .par_iter()
+            .map(|find| self.tell(find, rise_mm(find, space), options))
+            .collect();
         // the likeliest come first
         let last = told.iter().rposition(Option::is_some).map_or(0, |last| last + 1);
         let around = finds.len().min(last.max(ENOUGH_HEADS));
@@ -428,11 +433,11 @@ impl Detector {
         Ok(evidence.into_iter().map(in_image).collect())
     }
 
-    /// Verdict and drive of a find; `None` where it is nothing.
-    fn tell(&self, find: &Find, options: &Options) -> Option<Told> {
+    /// Verdict and drive of a find that rises so far above its sheet, where that is known; `None` where it is nothing.
+    fn tell(&self, find: &Find, rise_mm: Option<f64>, options: &Options) -> Option<Told> {
         let settings = &self.model.settings;
         let probability = |drive: Drive| drive.class().map_or(0.0, |c| f64::from(find.evidence.of(c)));
-        let calibrated = |p: f64| settings.corrections.probability(p);
+        let calibrated = |p: f64| settings.corrections.probability(p, rise_mm);
         let likeliest = Drive::KNOWN
             .into_iter()
             .max_by(|a, b| probability(*a).total_cmp(&probability(*b)))?;
@@ -531,6 +536,12 @@ fn sheet_normals(finds: &[Find], space: Option<(&DepthMap, &CameraModel)>) -> Ve
     facings(depth, camera, &heads)
 }
 
+/// How far a find rises above the sheet around it, mm; not asked for what is surely nothing.
+fn rise_mm(find: &Find, space: Option<(&DepthMap, &CameraModel)>) -> Option<f64> {
+    let (depth, camera) = space.filter(|_| find.evidence.fastener() >= MAY_BE)?;
+    RimProfile::of(depth, camera, find.pixel, find.diameter_px).map(|profile| profile.rise_mm())
+}
+
 /// One find for each fastener: candidates and scales that met on the same one become the most certain of them.
 fn merge(finds: Vec<Find>) -> Vec<Find> {
     suppress(
@@ -594,7 +605,7 @@ mod tests {
                 ..Options::default()
             };
             detector
-                .tell(&find(50.0, 30.0, cross, slotted), &options)
+                .tell(&find(50.0, 30.0, cross, slotted), None, &options)
                 .map(|told| (told.verdict, told.drive))
         };
         assert_eq!(verdict(0.95, 0.0, Drive::Cross), Some((Verdict::Screw, Drive::Cross)));

@@ -14,6 +14,10 @@ const SHEET_RING: [f64; 2] = [0.75, 1.6];
 const RINGS: [f64; 8] = [0.0, 0.12, 0.20, 0.27, 0.34, 0.41, 0.48, 0.56];
 /// Heights in those rings, and the head's diameter.
 pub const RIM_TERMS: usize = RINGS.len();
+/// Rings whose middle height is how far something rises: all that lie well within a head.
+const RISING_RINGS: usize = 4;
+/// Rises beyond these say no more, mm.
+const RISE_MM: [f64; 2] = [-1.0, 4.0];
 /// Weights of these where nothing was measured: the top around the recess, a little domed.
 pub(crate) const USUAL_RIM: [f64; RIM_TERMS] = [0.0, 0.0, 0.5, 0.5, 0.0, 0.0, 0.0, 0.02];
 /// Rings that must have depth of their own; the others are filled from their neighbours.
@@ -146,6 +150,16 @@ impl RimProfile {
             *term = heights[seen.min_by_key(|&k| (k.abs_diff(ring), k < ring))?]?;
         }
         Some(Self { sheet, terms })
+    }
+
+    /// How far what is there rises above the sheet, mm along the optical axis: the median of the inner rings, kept to -1 to 4 mm. Near 0
+    /// for a mark or a dent, below it for a hole.
+    pub fn rise_mm(&self) -> f64 {
+        let mut inner = [0.0; RISING_RINGS];
+        inner.copy_from_slice(&self.terms[..RISING_RINGS]);
+        inner.sort_by(f64::total_cmp);
+        let [low, high] = RISE_MM;
+        (0.5 * (inner[RISING_RINGS / 2 - 1] + inner[RISING_RINGS / 2])).clamp(low, high)
     }
 
     /// Height of the rim above the sheet, mm along the optical axis, by weights as those of [`Corrections::rim_height`].

@@ -81,15 +81,26 @@ pub struct Corrections {
     /// What makes a probability `p` of the networks true: its log odds are `a ln p - b ln(1 - p) + c` (beta calibration, Kull, Silva
     /// Filho and Flach 2017); `[a, b, c]`.
     pub score: [f64; 3],
+    /// The same where depth says how far a find rises above the sheet, `h` ([`RimProfile::rise_mm`](crate::RimProfile::rise_mm)): its log odds are
+    /// `a ln p - b ln(1 - p) + c + d h + e h²`. Marks, dents and holes do not rise, heads do.
+    pub raised_score: [f64; 5],
 }
 
 impl Corrections {
-    /// The networks' probability, corrected.
-    pub fn probability(&self, p: f64) -> f64 {
-        let p = p.clamp(1e-7, 1.0 - 1e-7);
-        let [a, b, c] = self.score;
-        let log_odds = a * p.ln() - b * (1.0 - p).ln() + c;
+    /// The networks' probability, corrected; with how far what it is of rises above the sheet, mm, where that was measured.
+    pub fn probability(&self, p: f64, rise_mm: Option<f64>) -> f64 {
+        let dot = |weights: &[f64], terms: &[f64]| weights.iter().zip(terms).map(|(w, t)| w * t).sum::<f64>();
+        let log_odds = match rise_mm {
+            Some(rise_mm) => dot(&self.raised_score, &Self::score_terms(p, rise_mm)),
+            None => dot(&self.score, &Self::score_terms(p, 0.0)),
+        };
         1.0 / (1.0 + (-log_odds).exp())
+    }
+
+    /// What a score depends on, in the order of [`raised_score`](Self::raised_score); [`score`](Self::score) has the first of it.
+    pub fn score_terms(p: f64, rise_mm: f64) -> [f64; 5] {
+        let p = p.clamp(1e-7, 1.0 - 1e-7);
+        [p.ln(), -(1.0 - p).ln(), 1.0, rise_mm, rise_mm.powi(2)]
     }
 
     /// Sigma of a centre, px, from that of the fused cues and the probability that the find is what it is taken for.
@@ -123,6 +134,7 @@ impl Default for Corrections {
             usual_height: [0.27, 0.09], // pan, truss, binding, washer and flange heads
             depth_sigma: 1.0,
             score: [1.0, 1.0, 0.0],
+            raised_score: [1.0, 1.0, 0.0, 0.0, 0.0],
         }
     }
 }

@@ -8,7 +8,7 @@ use image::RgbImage;
 use nn::RowSource;
 use rayon::prelude::*;
 
-use crate::layout::{NOMINAL_HEAD_PX, TRAINED_HEAD_PX, network_value};
+use crate::layout::{TRAINED_HEAD_PX, network_value};
 
 /// An 8-bit colour picture as the coarse network reads it.
 pub(crate) struct Rows<'a>(pub &'a RgbImage);
@@ -68,17 +68,20 @@ impl<'a> Level<'a> {
     }
 }
 
+/// The largest head of a level, px: within the trained band, but for what a guess of its size may be off.
+const LARGEST_HEAD_PX: f64 = 0.95 * *TRAINED_HEAD_PX.end();
+
 /// The scales at which every head of these diameters, px, falls into the band that the networks are trained for.
 pub(crate) fn pyramid_scales(head_px: &RangeInclusive<f64>) -> Vec<f64> {
     let (smallest, largest) = (head_px.start().max(1.0), head_px.end().max(head_px.start().max(1.0)));
     if TRAINED_HEAD_PX.contains(&smallest) && TRAINED_HEAD_PX.contains(&largest) {
         return vec![1.0];
     }
-    // An octave a level leaves a margin on both sides of the trained band.
+    // An octave a level leaves a margin in the trained band: below, since the larger a head, the better it is judged.
     let levels = (largest / smallest).log2().ceil().max(1.0);
     let step = (largest / smallest).powf(1.0 / levels);
     (0..levels as usize)
-        .map(|k| NOMINAL_HEAD_PX / (smallest * step.powf(k as f64 + 0.5)))
+        .map(|k| LARGEST_HEAD_PX / (smallest * step.powf(k as f64 + 1.0)))
         .collect()
 }
 
