@@ -27,6 +27,14 @@ impl Shot {
         )
     }
 
+    /// A pixel of the whole picture in the shot.
+    pub fn to_shot(&self, pixel: Pixel) -> Pixel {
+        Pixel::new(
+            pixel.u_px - f64::from(self.region.x_px),
+            pixel.v_px - f64::from(self.region.y_px),
+        )
+    }
+
     /// Size, megapixels.
     pub fn megapixels(&self) -> f64 {
         f64::from(self.region.width_px) * f64::from(self.region.height_px) * 1e-6

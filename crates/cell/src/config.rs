@@ -127,7 +127,7 @@ impl Default for Inspection {
             same_screw_mm: 4.0,
             stuck_cover_odds: 150.0,
             doubtful_max: 6,
-            vision_s_per_mpx: 0.05,
+            vision_s_per_mpx: 0.02,
         }
     }
 }

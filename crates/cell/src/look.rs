@@ -149,10 +149,16 @@ impl Judge<'_> {
         let certain = screws
             .iter()
             .filter(|s| !plan::is_doubtful(s.fits, odds) || s.verdict == Verdict::Other);
-        let heads: Vec<(Pixel, f64)> = certain.map(|s| (s.pixel, s.diameter_px)).collect();
-        let fit = FaceFit::around(&shot.frame, &heads, config.inspection.working_depth_mm);
+        let certain = certain.map(|s| (s.pixel, s.diameter_px));
         let before = so_far.faces.iter().rev().find(|f| f.face == *face);
         let before = before.map_or(&[][..], |f| &f.found);
+        // what is left of a face that has been worked on are its holes: the sheet around them is the face
+        let seen = so_far.faces.iter().filter(|f| f.face == *face).flat_map(|f| &f.found);
+        let holes = seen
+            .filter(|f| f.verdict == Verdict::Screw)
+            .map(|f| (shot.to_shot(Pixel::new(f.u_px, f.v_px)), f.diameter_px));
+        let heads: Vec<(Pixel, f64)> = certain.chain(holes).collect();
+        let fit = FaceFit::around(&shot.frame, &heads, config.inspection.working_depth_mm);
         plan::bound_doubtful(&mut screws, odds, config.inspection.doubtful_max, before, fit.as_ref());
         let (found, targets) = plan::plan(&screws, shot, fit.as_ref(), &self.reaches, config);
         let heads = screws

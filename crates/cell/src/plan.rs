@@ -441,12 +441,16 @@ fn head_normal(screw: &vision::Screw) -> Option<Direction<Camera>> {
     screw.top_normal.or(screw.normal)
 }
 
-/// How far the sheet leans. Two independent measurements, the sheet around the head and the top of the head, have to say so: an edge
-/// nearby spoils the one, a head seated askew the other.
+/// How far the sheet leans. Two independent measurements, the sheet around the head and the top of the head, have to say so, and both to
+/// the same side: an edge nearby spoils the one, a head seated askew the other.
 fn leaning(sheet: Option<Direction<Camera>>, head: Option<Direction<Camera>>) -> Option<f64> {
-    match (sheet.map(tilt_rad), head.map(tilt_rad)) {
-        (Some(a), Some(b)) => Some(a.min(b)),
-        (a, b) => a.or(b),
+    match (sheet, head) {
+        (Some(sheet), Some(head)) => {
+            let across = |n: Direction<Camera>| n.vector().xy();
+            let same_side = across(sheet).dot(&across(head)) / (across(sheet).norm() * across(head).norm()).max(1e-12);
+            Some(tilt_rad(sheet).min(tilt_rad(head)) * same_side.max(0.0))
+        }
+        (one, other) => one.or(other).map(tilt_rad),
     }
 }
 
@@ -517,4 +521,24 @@ pub fn exclusion(face: &FaceRecord, least_screws: usize, config: &CellConfig) ->
             format!("{name}: {screws} screw(s) found, the product has at least {least_screws}"),
         )
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_sheet_leans_only_if_sheet_and_head_lean_to_the_same_side() {
+        let towards = |degrees: f64, turned: f64| {
+            let (sin, cos) = degrees.to_radians().sin_cos();
+            let (v, u) = turned.to_radians().sin_cos();
+            Direction::new(sin * u, sin * v, -cos)
+        };
+        let lean = |sheet, head| leaning(sheet, head).expect("measured").to_degrees();
+        assert!((lean(towards(14.0, 30.0), towards(12.0, 40.0)) - 12.0).abs() < 0.3);
+        assert!(lean(towards(16.0, 30.0), towards(16.0, 125.0)) < 0.1);
+        assert!(lean(towards(16.0, 30.0), towards(2.0, 30.0)) < 2.1);
+        assert!((lean(towards(13.0, 0.0), None) - 13.0).abs() < 1e-6);
+        assert_eq!(leaning(None, None), None);
+    }
 }

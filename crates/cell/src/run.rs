@@ -935,7 +935,9 @@ impl Way<'_> {
         ));
         self.log(Event::Recovery { on: true })?;
         let mut pulled_again = false;
-        for face in held_by {
+        // the face that stands there costs no turn
+        let (here, elsewhere): (Vec<_>, Vec<_>) = held_by.iter().partition(|face| **face == step.present);
+        for face in here.into_iter().chain(elsewhere) {
             if !self.record.faces.iter().any(|f| f.face == *face) {
                 continue; // this product has no screws there, or the face cannot be presented yet
             }

@@ -136,32 +136,89 @@ impl Solid {
 /// step.
 #[derive(Clone, Debug)]
 pub struct Swept {
-    /// By part, then by posture, in the cell's frame.
-    parts: Vec<Vec<Capsule>>,
-    /// Corners of a box around each part on all of the way.
-    boxes: Vec<[Point3<f64>; 2]>,
+    parts: Vec<SweptPart>,
     step_mm: f64,
+}
+
+/// A part of an arm on a way.
+#[derive(Clone, Debug)]
+struct SweptPart {
+    /// Where it is, posture by posture, in the cell's frame.
+    places: Vec<Capsule>,
+    /// How far any point of it has come up to each posture, at most, mm.
+    come_mm: Vec<f64>,
+    /// Corners of a box around all of it.
+    low: Point3<f64>,
+    high: Point3<f64>,
+}
+
+impl SweptPart {
+    fn nowhere() -> Self {
+        Self {
+            places: Vec::new(),
+            come_mm: Vec::new(),
+            low: Point3::from([f64::INFINITY; 3]),
+            high: Point3::from([f64::NEG_INFINITY; 3]),
+        }
+    }
+
+    fn add(&mut self, capsule: Capsule) {
+        for end in [&capsule.from, &capsule.to] {
+            for axis in 0..3 {
+                self.low[axis] = self.low[axis].min(end[axis] - capsule.radius_mm);
+                self.high[axis] = self.high[axis].max(end[axis] + capsule.radius_mm);
+            }
+        }
+        // a point of a line moves no farther than the farther of its ends
+        let moved_mm = self.places.last().map_or(0.0, |last| {
+            nalgebra::distance(&last.from, &capsule.from).max(nalgebra::distance(&last.to, &capsule.to))
+        });
+        self.come_mm
+            .push(self.come_mm.last().copied().unwrap_or(0.0) + moved_mm);
+        self.places.push(capsule);
+    }
+
+    /// The first posture after one in which anything of it may be more than so far away from where it was, mm.
+    fn after(&self, posture: usize, mm: f64) -> usize {
+        let far = self.come_mm[posture] + mm;
+        posture + 1 + self.come_mm[posture + 1..].partition_point(|come_mm| *come_mm <= far)
+    }
+
+    fn is_clear_of(&self, other: &Self, keep_mm: f64) -> bool {
+        let far = (0..3)
+            .any(|axis| self.low[axis] - other.high[axis] > keep_mm || other.low[axis] - self.high[axis] > keep_mm);
+        if far {
+            return true;
+        }
+        // what has room to spare cannot lose it before it has moved so far: half of it is left for one, half for the other
+        let mut own = 0;
+        while own < self.places.len() {
+            let (mut spare_mm, mut theirs) = (f64::INFINITY, 0);
+            while theirs < other.places.len() {
+                let half_mm = 0.5 * (self.places[own].apart_mm(&other.places[theirs]) - keep_mm);
+                if half_mm < 0.0 {
+                    return false;
+                }
+                spare_mm = half_mm.min(spare_mm);
+                theirs = other.after(theirs, half_mm);
+            }
+            own = self.after(own, spare_mm);
+        }
+        true
+    }
 }
 
 impl Swept {
     pub(super) fn new(parts: usize, step_mm: f64) -> Self {
-        let nothing = [Point3::from([f64::INFINITY; 3]), Point3::from([f64::NEG_INFINITY; 3])];
         Self {
-            parts: vec![Vec::new(); parts],
-            boxes: vec![nothing; parts],
+            parts: vec![SweptPart::nowhere(); parts],
             step_mm,
         }
     }
 
     pub(super) fn add(&mut self, body: Vec<Capsule>) {
-        for ((part, [low, high]), capsule) in self.parts.iter_mut().zip(&mut self.boxes).zip(body) {
-            for end in [&capsule.from, &capsule.to] {
-                for axis in 0..3 {
-                    low[axis] = low[axis].min(end[axis] - capsule.radius_mm);
-                    high[axis] = high[axis].max(end[axis] + capsule.radius_mm);
-                }
-            }
-            part.push(capsule);
+        for (part, capsule) in self.parts.iter_mut().zip(body) {
+            part.add(capsule);
         }
     }
 
@@ -169,23 +226,11 @@ impl Swept {
     pub fn is_clear_of(&self, other: &Self, margin_mm: f64) -> bool {
         // each may be half a step from the posture that stands for it
         let keep_mm = margin_mm + 0.5 * (self.step_mm + other.step_mm);
-        let far = |[low, high]: &[Point3<f64>; 2], [other_low, other_high]: &[Point3<f64>; 2]| {
-            (0..3).any(|axis| low[axis] - other_high[axis] > keep_mm || other_low[axis] - high[axis] > keep_mm)
-        };
-        let near = |(a, b): (usize, usize)| {
-            !far(&self.boxes[a], &other.boxes[b])
-                && self.parts[a].iter().any(|part| {
-                    other.parts[b].iter().any(|obstacle| {
-                        let balls_mm = nalgebra::distance(&part.middle(), &obstacle.middle())
-                            - part.ball_mm()
-                            - obstacle.ball_mm();
-                        balls_mm < keep_mm && part.apart_mm(obstacle) < keep_mm
-                    })
-                })
-        };
-        !(0..self.parts.len())
-            .flat_map(|a| (0..other.parts.len()).map(move |b| (a, b)))
-            .any(near)
+        let pairs = self
+            .parts
+            .iter()
+            .flat_map(|own| other.parts.iter().map(move |part| (own, part)));
+        pairs.into_iter().all(|(own, part)| own.is_clear_of(part, keep_mm))
     }
 }
 
@@ -201,6 +246,29 @@ mod tests {
 
     fn point() -> impl Strategy<Value = Point3<f64>> {
         prop::array::uniform3(-800.0..800.0f64).prop_map(Point3::from)
+    }
+
+    proptest! {
+        #[test]
+        fn a_swept_part_is_clear_if_every_posture_of_it_is(
+            ends in prop::collection::vec((point(), point()), 1..5), others in prop::collection::vec((point(), point()), 1..5),
+            away_mm in 0.0..1500.0f64, keep_mm in 0.0..80.0f64,
+        ) {
+            // ways in small steps between some postures
+            let way = |ends: &[(Point3<f64>, Point3<f64>)], by_mm: f64| {
+                let mut part = SweptPart::nowhere();
+                for two in ends.windows(2) {
+                    for k in 0..12 {
+                        let between = |a: &Point3<f64>, b: &Point3<f64>| a + (b - a) * (f64::from(k) / 12.0) + Vector3::x() * by_mm;
+                        part.add(Capsule::new(between(&two[0].0, &two[1].0), between(&two[0].1, &two[1].1), 60.0));
+                    }
+                }
+                part
+            };
+            let (own, other) = (way(&ends, 0.0), way(&others, away_mm));
+            let each = own.places.iter().all(|a| other.places.iter().all(|b| a.apart_mm(b) >= keep_mm));
+            prop_assert_eq!(own.is_clear_of(&other, keep_mm), each);
+        }
     }
 
     fn block() -> Solid {

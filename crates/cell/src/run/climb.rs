@@ -8,6 +8,9 @@ use crate::plan::{SafeTarget, Target};
 use crate::policy::{Case, Choice};
 use crate::record::{Event, Verdict};
 
+/// A head that only its stuck cover makes a screw is searched around if it is one with so much probability.
+const WORTH_A_SEARCH: f64 = 0.9;
+
 impl Way<'_> {
     /// Tries one rung after the other until the screw is out, is not there, or nothing is left. The other arm rests.
     ///
@@ -24,8 +27,9 @@ impl Way<'_> {
         let (found, mut place) = (target.found, target.place);
         self.log(Event::Recovery { on: true })?;
         while let Some(rung) = climb.next(cause, self.bursts(found)) {
-            // A head that is tried for its cover's sake alone may be none: it is looked at again, but not searched for.
-            if cause == Cause::MissedHead && rung != Rung::LookAgain && self.is_doubtful(found) {
+            // A head that is tried for its cover's sake alone may be none: it is looked at again, but hardly searched for.
+            let searches = cause == Cause::MissedHead && rung != Rung::LookAgain;
+            if searches && self.is_doubtful(found) && self.score(found) < WORTH_A_SEARCH {
                 break;
             }
             let end = match rung {
@@ -59,6 +63,12 @@ impl Way<'_> {
     pub(super) fn bursts(&self, found: usize) -> usize {
         let attempts = self.record.faces.last().into_iter().flat_map(|f| &f.attempts);
         attempts.filter(|a| a.found == found).map(|a| a.bursts.len()).sum()
+    }
+
+    /// How probably a find of the face that is being worked on is a screw.
+    fn score(&self, found: usize) -> f64 {
+        let find = self.record.faces.last().and_then(|f| f.found.get(found));
+        find.map_or(0.0, |find| find.score)
     }
 
     /// Drives at places on a ring, until the bit meets something.
