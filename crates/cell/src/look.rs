@@ -354,3 +354,132 @@ fn seen_by_a_person(shot: &Shot, pixel: Pixel) -> Option<vision::Screw> {
         sigma_depth_mm: None,
     })
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::device::Region;
+    use crate::program::Program;
+    use geometry::{DepthMap, RgbImage};
+
+    /// One head in doubt in the corner of a frame of flanges.
+    struct InDoubt;
+
+    const AT: Pixel = Pixel::new(640.0, 100.0);
+
+    impl Finder for InDoubt {
+        fn find(&self, frame: &RgbdFrame, odds: f64) -> Result<Vec<vision::Screw>, DeviceError> {
+            let alone = 0.1;
+            let fits = odds * alone / (odds * alone + 1.0 - alone);
+            Ok(vec![vision::Screw {
+                pixel: AT,
+                sigma_px: 0.3,
+                diameter_px: 20.0,
+                score: fits,
+                fits,
+                drive: vision::Drive::Unknown,
+                verdict: if fits > 0.6 { Verdict::Screw } else { Verdict::Review },
+                cues: Vec::new(),
+                angle_rad: None,
+                camera: frame.camera.map(|camera| camera.unproject(AT, 1500.0)),
+                normal: None,
+                top_normal: None,
+                sigma_lateral_mm: Some(0.1),
+                sigma_depth_mm: Some(0.1),
+            }])
+        }
+
+        fn model(&self) -> String {
+            "doubt".into()
+        }
+    }
+
+    /// A frame of flanges, 1500 mm away, and what is seen through it and beside it, 280 mm behind.
+    fn shot() -> Shot {
+        let mut map = DepthMap {
+            width: 400,
+            height: 300,
+            step: 2,
+            depth_mm: vec![1780.0; 120_000],
+        };
+        for j in 30..275 {
+            for i in 60..340 {
+                if !((75..240).contains(&j) && (105..295).contains(&i)) {
+                    map.depth_mm[(j * 400 + i) as usize] = 1500.0;
+                }
+            }
+        }
+        Shot {
+            frame: RgbdFrame {
+                color: RgbImage::new(800, 600),
+                depth: Some(map),
+                camera: Some(CameraModel::pinhole(800, 600, 900.0, 900.0)),
+                t_s: 0.0,
+            },
+            region: Region {
+                x_px: 0,
+                y_px: 0,
+                width_px: 800,
+                height_px: 600,
+            },
+        }
+    }
+
+    #[test]
+    fn a_face_whose_screws_are_out_is_known_by_its_holes() {
+        let (config, program) = (CellConfig::simulated(), Program::paper().expect("embedded"));
+        let judge = Judge {
+            finder: &InDoubt,
+            reaches: Vec::new(),
+            config: &config,
+        };
+        let (shot, face) = (shot(), FaceId("front_inner".into()));
+        let verdict = |so_far: &UnitRecord| {
+            let question = Question {
+                index: 5,
+                step: &program.steps[5],
+                face: &face,
+                purpose: Purpose::Missed,
+                so_far,
+                clicks: None,
+            };
+            judge.face(&shot, &question).expect("judged").face.found[0].verdict
+        };
+        let mut record = UnitRecord::new(1, 0.0);
+        // what is behind the flanges is most of what is seen
+        assert_eq!(verdict(&record), Verdict::Review, "the scene should mislead");
+        let hole = |u_px: f64, v_px: f64| Found {
+            u_px,
+            v_px,
+            sigma_px: 0.2,
+            diameter_px: 20.0,
+            score: 0.99,
+            drive: "cross".into(),
+            verdict: Verdict::Screw,
+            camera_mm: None,
+            base_mm: None,
+            sigma_lateral_mm: None,
+            sigma_depth_mm: None,
+            hull: None,
+            tilt_rad: None,
+            left_alone: None,
+            refusal: None,
+        };
+        record.faces.push(FaceRecord {
+            step: 4,
+            step_name: "front inner screws".into(),
+            face: face.clone(),
+            purpose: Purpose::Work,
+            t_s: 0.0,
+            picture: None,
+            width_px: 800,
+            height_px: 600,
+            plane: None,
+            found: [(160.0, 100.0), (400.0, 98.0), (150.0, 300.0), (160.0, 500.0)]
+                .map(|(u, v)| hole(u, v))
+                .to_vec(),
+            attempts: Vec::new(),
+        });
+        assert_eq!(verdict(&record), Verdict::Screw);
+    }
+}
