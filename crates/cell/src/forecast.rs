@@ -5,7 +5,7 @@
 
 use crate::device::DriveEnd;
 use crate::digest::Digest;
-use crate::record::{NgReason, Outcome, Purpose, UnitRecord};
+use crate::record::{FaceRecord, NgReason, Outcome, Purpose, UnitRecord};
 use rand::{RngExt, SeedableRng};
 use rand_distr::{Beta, Distribution, Poisson};
 use rand_pcg::Pcg64Mcg;
@@ -269,7 +269,9 @@ impl Assumptions {
             .map(|(r, _)| *r)
             .collect();
         let attempts = || in_scope.iter().flat_map(|r| r.attempts());
-        let screws = attempts().count();
+        let left = finished.iter().map(|(_, outcome)| left_in(outcome));
+        let (stayed, not_found) = left.fold((0, 0), |sum, left| (sum.0 + left.0, sum.1 + left.1));
+        let screws = attempts().filter(|a| a.removed()).count() + stayed;
         if in_scope.is_empty() || screws == 0 {
             return Err(ForecastError::TooLittle {
                 units: in_scope.len(),
@@ -293,28 +295,15 @@ impl Assumptions {
             .iter()
             .flat_map(|r| &r.faces)
             .filter(|f| f.purpose == Purpose::Missed)
-            .flat_map(|f| &f.attempts)
-            .count();
-        // screws that were never found are not in the journal: the covers that stayed for no seen reason are
-        let stuck = finished
-            .iter()
-            .filter(|(_, o)| {
-                matches!(
-                    o,
-                    Outcome::Ng {
-                        reason: NgReason::CoverStuck,
-                        ..
-                    }
-                )
-            })
-            .count();
+            .map(FaceRecord::removed)
+            .sum::<usize>();
         self.screw.found = Chance::Counted {
             hits: screws - later,
-            of: screws + stuck,
+            of: screws + not_found,
         };
         self.screw.found_later = Chance::Counted {
             hits: later,
-            of: later + stuck,
+            of: later + not_found,
         };
         let at_once = attempts()
             .filter(|a| a.removed() && a.bursts.first().and_then(|b| b.end) == Some(DriveEnd::Removed))
@@ -333,7 +322,7 @@ impl Assumptions {
         self.times_s.inspection = mean(&|r| r.times.inspection_s);
         self.times_s.covers = mean(&|r| r.times.covers_s);
         self.times_s.screw = mean(&|r| r.times.screws_s) * units / screws as f64;
-        let recoveries = (screws - at_once + stuck).max(1) as f64;
+        let recoveries = (screws - at_once + not_found).max(1) as f64;
         self.times_s.ladder = mean(&|r| r.times.recovery_s) * units / recoveries;
         self.times_s.look_for_missed = self.times_s.ladder;
         let out: Vec<f64> = finished
@@ -678,6 +667,19 @@ pub struct Prediction {
     pub finished: bool,
 }
 
+/// Screws that are left in a unit: found but not to be taken out, and not found. What stayed in a unit whose covers all came off was no screw,
+/// nor is what the bit never met: where a cover stays all the same, what holds it was not found.
+fn left_in(outcome: &Outcome) -> (usize, usize) {
+    match outcome {
+        Outcome::Ng { reason, .. } => match reason {
+            NgReason::CoverStuck | NgReason::ScrewMissed => (0, 1),
+            NgReason::ScrewSeized | NgReason::ScrewCamOut => (1, 0),
+            _ => (0, 0),
+        },
+        _ => (0, 0),
+    }
+}
+
 /// What an assumed chance is worth beside counts, as so many trials.
 const ASSUMED_WORTH: f64 = 10.0;
 
@@ -702,9 +704,9 @@ impl Learnt {
         }
     }
 
-    fn saw(&mut self, hits: usize, misses: usize) {
-        self.hits += hits as f64;
-        self.of += (hits + misses) as f64;
+    fn saw(&mut self, hits: f64, misses: f64) {
+        self.hits += hits;
+        self.of += hits + misses;
     }
 
     fn mean(self) -> f64 {
@@ -734,18 +736,17 @@ impl Chances {
 
     /// Takes note of a unit that is done.
     fn learn(&mut self, unit: &Digest) {
-        self.out_at_once.saw(unit.out_at_once, unit.out_later + unit.stayed);
-        self.out_after_ladder.saw(unit.out_later, unit.stayed);
-        // a cover that stayed for no reason that was seen: a screw that was not found
-        let stuck = matches!(
-            unit.outcome,
-            Some(Outcome::Ng {
-                reason: NgReason::CoverStuck,
-                ..
-            })
-        );
-        self.found_later.saw(unit.found_later, stuck.into());
-        self.seen.saw(unit.removed + unit.stayed, stuck.into());
+        let (stayed, not_found) = unit.outcome.as_ref().map_or((0, 0), left_in);
+        let (stayed, not_found) = (stayed as f64, not_found as f64);
+        let (at_once, later) = (unit.out_at_once as f64, unit.out_later as f64);
+        self.out_at_once.saw(at_once, later + stayed);
+        self.out_after_ladder.saw(later, stayed);
+        let found_later = unit.found_later as f64;
+        self.found_later.saw(found_later, not_found);
+        // some of those found later had been seen, in doubt
+        let in_doubt: f64 = unit.scores_in_doubt.iter().sum();
+        let unseen = not_found + (found_later - in_doubt).max(0.0);
+        self.seen.saw(unit.removed as f64 + stayed + not_found - unseen, unseen);
     }
 
     /// Probability that all comes out.
@@ -882,6 +883,7 @@ mod tests {
         let units: Vec<Digest> = (0..1200)
             .map(|number| {
                 let mut unit = Digest::of(&UnitRecord::new(number, 0.0));
+                let mut left = 0;
                 for k in 0..22 {
                     let (score, is_screw) = if k < 2 {
                         (doubt, rng.random_bool(doubt))
@@ -894,15 +896,17 @@ mod tests {
                         unit.scores_acted_on.push(score);
                     }
                     match (is_screw, rng.random_bool(once), rng.random_bool(ladder)) {
-                        (false, ..) => {}
+                        // what is no screw does not come out either
+                        (false, ..) => unit.stayed += 1,
                         (_, true, _) => unit.out_at_once += 1,
                         (_, _, true) => unit.out_later += 1,
-                        _ => unit.stayed += 1,
+                        _ => left += 1,
                     }
                 }
+                unit.stayed += left;
                 unit.removed = unit.out_at_once + unit.out_later;
                 let stays = NgReason::ScrewSeized;
-                unit.outcome = Some(if unit.stayed == 0 {
+                unit.outcome = Some(if left == 0 {
                     Outcome::Ok
                 } else {
                     Outcome::Ng {
