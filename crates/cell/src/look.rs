@@ -316,8 +316,7 @@ pub fn cover_off(now: &RgbdFrame, before: Option<&FaceRecord>) -> PullEnd {
 /// What is a screw once a person has clicked.
 fn clicked_on(shot: &Shot, mut screws: Vec<vision::Screw>, clicks: &[[f64; 2]]) -> Vec<vision::Screw> {
     for click in clicks {
-        let corner = [f64::from(shot.region.x_px), f64::from(shot.region.y_px)];
-        let pixel = Pixel::new(click[0] - corner[0], click[1] - corner[1]);
+        let pixel = shot.to_shot(Pixel::new(click[0], click[1]));
         let near = screws
             .iter_mut()
             .filter(|s| s.pixel.distance_px(&pixel) < SAME_HEAD * s.diameter_px)
