@@ -8,7 +8,7 @@ use crate::plan::{SafeTarget, Target};
 use crate::policy::{Case, Choice};
 use crate::record::{Event, Verdict};
 
-/// A head that only its stuck cover makes a screw is searched around if it is one with so much probability.
+/// A head is searched around if the picture alone makes it a screw with so much probability.
 const WORTH_A_SEARCH: f64 = 0.9;
 
 impl Way<'_> {
@@ -27,9 +27,9 @@ impl Way<'_> {
         let (found, mut place) = (target.found, target.place);
         self.log(Event::Recovery { on: true })?;
         while let Some(rung) = climb.next(cause, self.bursts(found)) {
-            // A head that is tried for its cover's sake alone may be none: it is looked at again, but hardly searched for.
+            // A head that may be none is looked at again, but not searched for.
             let searches = cause == Cause::MissedHead && rung != Rung::LookAgain;
-            if searches && self.is_doubtful(found) && self.score(found) < WORTH_A_SEARCH {
+            if searches && (self.is_doubtful(found) || self.score(found) < WORTH_A_SEARCH) {
                 break;
             }
             let end = match rung {
