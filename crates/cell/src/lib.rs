@@ -44,6 +44,7 @@ pub mod look;
 pub mod motion;
 pub mod packml;
 pub mod plan;
+pub mod plane;
 pub mod policy;
 pub mod program;
 pub mod record;

@@ -1,10 +1,11 @@
 //! From a shot to a decision: what the program makes of a picture, and nothing else. The [`Runner`](crate::run::Runner) and a replay
 //! both decide here, so that the same frame, model, maps and cell file give the same decision, byte by byte.
 
-use crate::capture::{FaceFit, Shot, sheet_depth_mm, sheet_normal};
+use crate::capture::Shot;
 use crate::config::CellConfig;
 use crate::device::DeviceError;
 use crate::plan::{self, Reach, SafeTarget, Target};
+use crate::plane::{FaceFit, sheet_depth_mm, sheet_normal};
 use crate::program::{FaceId, Step};
 use crate::record::{ExclusionReason, FacePlane, FaceRecord, Found, PullEnd, Purpose, UnitRecord, Verdict};
 use crate::run::Finder;
@@ -159,18 +160,22 @@ impl Judge<'_> {
             .map(|f| (shot.to_shot(Pixel::new(f.u_px, f.v_px)), f.diameter_px));
         let heads: Vec<(Pixel, f64)> = certain.chain(holes).collect();
         let fit = FaceFit::around(&shot.frame, &heads, config.inspection.working_depth_mm);
-        plan::bound_doubtful(&mut screws, odds, config.inspection.doubtful_max, before, fit.as_ref());
+        plan::bound_doubtful(
+            &mut screws,
+            odds,
+            config.inspection.doubtful_max,
+            before,
+            fit.as_ref(),
+            &shot.frame,
+        );
         let (found, targets) = plan::plan(&screws, shot, fit.as_ref(), &self.reaches, config);
         let heads = screws
             .iter()
             .filter(|s| s.verdict == Verdict::Screw)
             .filter_map(|s| s.top_normal);
-        let plane = fit.as_ref().and_then(|fit| {
-            let heads_lean_rad = fit.lean_rad(heads);
-            fit.plane().map(|plane| FacePlane {
-                heads_lean_rad,
-                ..plane
-            })
+        let plane = fit.as_ref().map(|fit| FacePlane {
+            heads_lean_rad: fit.lean_rad(heads),
+            ..fit.plane()
         });
         let seen = FaceRecord {
             step: index,

@@ -6,12 +6,13 @@
 
 mod allot;
 
-use crate::capture::{FaceFit, Shot, sheet_normal, tilt_rad};
+use crate::capture::Shot;
 use crate::config::{Approach, CellConfig};
 use crate::motion::{ArmMotion, Refusal, Way};
+use crate::plane::{FaceFit, sheet_normal, tilt_rad};
 use crate::record::{ExclusionReason, FaceRecord, Found, Hull, LeftAlone, Verdict};
 use calibration::{Map, MappedPoint};
-use geometry::{Base, Camera, Direction, Point, Tool, Transform};
+use geometry::{Base, Camera, Direction, Point, RgbdFrame, Tool, Transform};
 use nalgebra::{Matrix3, Rotation3, UnitQuaternion, Vector3};
 
 /// Shortest way in front of a screw on which the bit can still be lined up, mm.
@@ -22,6 +23,10 @@ const SAME_WAY_RAD: f64 = 5e-4;
 
 /// The screws of a face stand no farther in front of its plane or behind it, mm: ribs and sunk flanges.
 const ON_FACE_MM: f64 = 20.0;
+/// On a plate behind it that looks the same way no farther than this, mm.
+const BEHIND_FACE_MM: f64 = 80.0;
+/// How far the sheet of such a plate may lean from the face, rad.
+const SAME_WAY_AS_FACE_RAD: f64 = 0.06;
 
 /// A place that an arm may be sent to: the point and the straight way to it lie in the calibrated volume of that arm's map, and
 /// the whole way there is free.
@@ -290,11 +295,25 @@ pub fn is_doubtful(fits: f64, odds: f64) -> bool {
 /// # Arguments
 /// * `before` – finds of the same face when it was looked at without the odds: what was in doubt then and is now is likelier than
 ///   what one of two pictures shows.
-/// * `face` – where the face lies: what is deep behind it is a gap of a grille.
-pub fn bound_doubtful(screws: &mut [vision::Screw], odds: f64, most: usize, before: &[Found], face: Option<&FaceFit>) {
-    let on_face = |screw: &vision::Screw| match (face, screw.camera) {
-        (Some(face), Some(at)) => (at.z_mm() - face.depth_mm(screw.pixel)).abs() <= ON_FACE_MM,
-        _ => false, // no depth, no target
+/// * `face` – where the face lies: what is deep behind it, and not on a plate that looks the same way, is a gap of a grille.
+pub fn bound_doubtful(
+    screws: &mut [vision::Screw],
+    odds: f64,
+    most: usize,
+    before: &[Found],
+    face: Option<&FaceFit>,
+    frame: &RgbdFrame,
+) {
+    let on_face = |screw: &vision::Screw| {
+        let (Some(face), Some(at)) = (face, screw.camera) else {
+            return false; // no depth, no target
+        };
+        let behind_mm = at.z_mm() - face.depth_mm(screw.pixel);
+        let looks_the_same_way = || {
+            let sheet = sheet_normal(frame, screw.pixel, screw.diameter_px);
+            sheet.is_some_and(|sheet| sheet.angle_rad(face.normal()) <= SAME_WAY_AS_FACE_RAD)
+        };
+        behind_mm.abs() <= ON_FACE_MM || (0.0..=BEHIND_FACE_MM).contains(&behind_mm) && looks_the_same_way()
     };
     let seen_before = |screw: &vision::Screw| {
         let near = |f: &&Found| (f.u_px - screw.pixel.u_px).hypot(f.v_px - screw.pixel.v_px) < screw.diameter_px;
@@ -461,7 +480,7 @@ fn line_of_approach(
     face: Option<&FaceFit>,
     config: &CellConfig,
 ) -> Option<Direction<Camera>> {
-    let Some(face) = face.and_then(FaceFit::normal) else {
+    let Some(face) = face.map(FaceFit::normal) else {
         return sheet.or(head);
     };
     let leans = |normal: Direction<Camera>| normal.angle_rad(face) > config.approach.local_normal_from_rad;

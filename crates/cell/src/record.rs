@@ -103,7 +103,7 @@ pub struct FacePlane {
     pub depth_mm: f64,
     /// Tilt against the camera's axis, rad.
     pub tilt_rad: f64,
-    /// How far the heads of its screws lean from it together, rad; `None` with fewer than five.
+    /// How far the heads of its screws lean from it together, rad; `None` with fewer than three, or where of a few not all do.
     #[serde(default)]
     pub heads_lean_rad: Option<f64>,
 }
