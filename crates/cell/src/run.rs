@@ -935,9 +935,11 @@ impl Way<'_> {
         ));
         self.log(Event::Recovery { on: true })?;
         let mut pulled_again = false;
-        // the face that stands there costs no turn
-        let (here, elsewhere): (Vec<_>, Vec<_>) = held_by.iter().partition(|face| **face == step.present);
-        for face in here.into_iter().chain(elsewhere) {
+        // where a head was in doubt it is the likeliest; of faces alike, the one that stands there costs no turn
+        let mut faces: Vec<(&FaceId, f64)> = held_by.iter().map(|face| (face, self.doubt(face))).collect();
+        let stands_there = |face: &FaceId| *face == step.present;
+        faces.sort_by(|a, b| (b.1.total_cmp(&a.1)).then(stands_there(b.0).cmp(&stands_there(a.0))));
+        for (face, _) in faces {
             if !self.record.faces.iter().any(|f| f.face == *face) {
                 continue; // this product has no screws there, or the face cannot be presented yet
             }
@@ -969,6 +971,21 @@ impl Way<'_> {
                 detail: format!("the {cover} cover did not come off, and no screw that holds it was seen"),
             },
         )))
+    }
+
+    /// The highest score of the heads that were left for a person when a face was worked on; 0 without any.
+    fn doubt(&self, face: &FaceId) -> f64 {
+        let worked_on = |f: &&FaceRecord| f.face == *face && f.purpose == Purpose::Work;
+        let found = self
+            .record
+            .faces
+            .iter()
+            .rev()
+            .find(worked_on)
+            .into_iter()
+            .flat_map(|f| &f.found);
+        let doubtful = found.filter(|f| f.verdict == Verdict::Review);
+        doubtful.map(|f| f.score).fold(0.0, f64::max)
     }
 
     /// A screw on these faces that is known to stand, as the reason of a failure.

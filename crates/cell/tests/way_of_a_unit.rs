@@ -499,6 +499,29 @@ fn on_a_stuck_cover_only_the_likeliest_doubtful_heads_are_tried() {
 }
 
 #[test]
+fn a_stuck_cover_s_screw_is_looked_for_first_where_a_head_was_in_doubt() {
+    // the left has a head that is for review unless a cover is stuck
+    let doubt = |fake: &Fake, odds: f64, found: &mut Vec<vision::Screw>| {
+        let on_the_left = fake.world().presented == "left";
+        for screw in found.iter_mut().filter(|_| on_the_left && odds == 1.0) {
+            (screw.score, screw.fits, screw.verdict) = (0.4, 0.4, vision::Verdict::Review);
+        }
+    };
+    let fake = Fake::new(&[
+        ("front", vec![screw(0.0, 0.0)]),
+        ("left", vec![screw(0.0, 0.0)]),
+        ("front_inner", vec![screw(50.0, 0.0)]),
+    ]);
+    let folder = tempfile::tempdir().expect("folder");
+    let program = Program::paper().expect("built-in program");
+    let mut runner = runner_with(&fake, folder.path(), program, Altered(fake.clone(), doubt));
+    let record = block_on(runner.run_unit(&Silent)).expect("a record");
+    assert_eq!(record.outcome, Some(Outcome::Ok));
+    let again = record.faces.iter().filter(|f| f.purpose == Purpose::Missed);
+    assert_eq!(again.map(|f| f.face.0.as_str()).collect::<Vec<_>>(), ["left"]);
+}
+
+#[test]
 fn a_screw_that_is_seen_but_not_met_is_searched_for_around_its_place() {
     // every centre is off by more than the bit's cone reaches
     let off = |_: &Fake, _: f64, found: &mut Vec<vision::Screw>| {
