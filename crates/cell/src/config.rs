@@ -185,10 +185,10 @@ pub struct Approach {
 impl Default for Approach {
     fn default() -> Self {
         Self {
-            standoff_mm: 40.0,
-            approach_mm_s: 150.0,
+            standoff_mm: 30.0,
+            approach_mm_s: 200.0,
             retract_mm_s: 400.0,
-            local_normal_from_rad: 3f64.to_radians(),
+            local_normal_from_rad: 6f64.to_radians(),
             map_age_max_days: 30.0,
         }
     }

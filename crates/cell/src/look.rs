@@ -212,6 +212,7 @@ impl Judge<'_> {
     /// The screw that still stands at a place of the whole picture, mapped anew.
     ///
     /// # Arguments
+    /// * `face` – the plane of its face as measured when the whole of it was looked at; the region is too small to measure it.
     /// * `clicks` – where a person has clicked, if one was asked.
     ///
     /// # Returns
@@ -223,6 +224,7 @@ impl Judge<'_> {
         &self,
         near: &Shot,
         (center, half_px): (Pixel, f64),
+        face: Option<FacePlane>,
         odds: f64,
         clicks: Option<&[[f64; 2]]>,
     ) -> Result<(bool, Option<SafeTarget>), DeviceError> {
@@ -235,8 +237,8 @@ impl Judge<'_> {
             .filter(|s| s.verdict == Verdict::Screw && off(s) <= same_px)
             .min_by(|a, b| off(a).total_cmp(&off(b)));
         let Some(screw) = closest else { return Ok((false, None)) };
-        // the region is too small for the plane of the face: the sheet around the screw has to do
-        let (_, again) = plan::plan(&[screw], near, None, &self.reaches, self.config);
+        let fit = face.and_then(|plane| FaceFit::known(&plane, near.frame.camera?));
+        let (_, again) = plan::plan(&[screw], near, fit.as_ref(), &self.reaches, self.config);
         Ok((true, again.first().map(|t| t.place)))
     }
 

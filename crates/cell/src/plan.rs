@@ -25,6 +25,8 @@ const SAME_WAY_RAD: f64 = 5e-4;
 const ON_FACE_MM: f64 = 20.0;
 /// On a plate behind it that looks the same way no farther than this, mm.
 const BEHIND_FACE_MM: f64 = 80.0;
+/// Sheet and head lean the same way if they lean no further from each other, rad.
+const SAME_LEAN_RAD: f64 = 0.07;
 /// How far the sheet of such a plate may lean from the face, rad.
 const SAME_WAY_AS_FACE_RAD: f64 = 0.06;
 
@@ -473,7 +475,8 @@ fn leaning(sheet: Option<Direction<Camera>>, head: Option<Direction<Camera>>) ->
     }
 }
 
-/// The normal that the bit follows: the face's plane, which is measured best, unless the sheet around the screw clearly leans.
+/// The normal that the bit follows: the face's plane, which is measured best, unless the sheet around the screw and its head both lean from it, and
+/// the same way.
 fn line_of_approach(
     sheet: Option<Direction<Camera>>,
     head: Option<Direction<Camera>>,
@@ -485,7 +488,9 @@ fn line_of_approach(
     };
     let leans = |normal: Direction<Camera>| normal.angle_rad(face) > config.approach.local_normal_from_rad;
     match (sheet, head) {
-        (Some(sheet), Some(head)) if leans(sheet) && leans(head) => Some(sheet),
+        (Some(sheet), Some(head)) if leans(sheet) && leans(head) && sheet.angle_rad(head) <= SAME_LEAN_RAD => {
+            Some(sheet)
+        }
         _ => Some(face),
     }
 }
@@ -559,5 +564,30 @@ mod tests {
         assert!(lean(towards(16.0, 30.0), towards(2.0, 30.0)) < 2.1);
         assert!((lean(towards(13.0, 0.0), None) - 13.0).abs() < 1e-6);
         assert_eq!(leaning(None, None), None);
+    }
+
+    #[test]
+    fn the_bit_follows_the_face_unless_sheet_and_head_lean_alike() {
+        let towards = |degrees: f64| {
+            let (sin, cos) = degrees.to_radians().sin_cos();
+            Direction::<Camera>::new(sin, 0.0, -cos)
+        };
+        let camera = geometry::CameraModel::pinhole(800, 600, 900.0, 900.0);
+        let plane = crate::record::FacePlane {
+            depth_mm: 1500.0,
+            tilt_rad: 0.0,
+            normal: towards(0.0),
+            heads_lean_rad: None,
+        };
+        let face = FaceFit::known(&plane, camera).expect("known");
+        let config = CellConfig::simulated();
+        let line = |sheet: f64, head: f64| {
+            let line = line_of_approach(towards(sheet), towards(head), Some(&face), &config).expect("a line");
+            line.angle_rad(face.normal()).to_degrees()
+        };
+        assert!((line(9.0, 8.0) - 9.0).abs() < 1e-6, "a dent");
+        assert_eq!(line(60.0, 9.0), 0.0, "a plane through an edge");
+        assert_eq!(line(4.0, 4.0), 0.0, "no more than the measurement");
+        assert_eq!(line(9.0, -8.0), 0.0);
     }
 }

@@ -109,6 +109,16 @@ impl FaceFit {
         }
     }
 
+    /// A plane that was measured before, as this camera sees it; `None` where the record does not say which way it looks.
+    pub fn known(plane: &FacePlane, camera: CameraModel) -> Option<Self> {
+        let normal = plane.normal?;
+        Some(Self {
+            normal,
+            distance_mm: plane.depth_mm * normal.vector().z,
+            camera,
+        })
+    }
+
     /// Normal of the face, towards the camera.
     pub fn normal(&self) -> Direction<Camera> {
         self.normal
@@ -142,6 +152,7 @@ impl FaceFit {
         FacePlane {
             depth_mm: self.distance_mm / self.normal.vector().z,
             tilt_rad: tilt_rad(self.normal),
+            normal: Some(self.normal),
             heads_lean_rad: None,
         }
     }

@@ -8,7 +8,7 @@ use crate::frames::KeptFrame;
 use crate::look::{Decision, SecondLook};
 use crate::policy::Ruling;
 use crate::program::FaceId;
-use geometry::{Base, Camera, Point};
+use geometry::{Base, Camera, Direction, Point};
 use serde::{Deserialize, Serialize};
 use std::fmt;
 
@@ -103,6 +103,9 @@ pub struct FacePlane {
     pub depth_mm: f64,
     /// Tilt against the camera's axis, rad.
     pub tilt_rad: f64,
+    /// Which way it looks, towards the camera; not in journals of versions before.
+    #[serde(default)]
+    pub normal: Option<Direction<Camera>>,
     /// How far the heads of its screws lean from it together, rad; `None` with fewer than three, or where of a few not all do.
     #[serde(default)]
     pub heads_lean_rad: Option<f64>,

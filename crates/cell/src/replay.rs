@@ -227,8 +227,13 @@ impl<'a> UnitReplay<'a> {
                 let (kind, now, second, was) = match (second_look, &frames[..], &places[..]) {
                     (Some(was), [frame], [(found, pixel, half_px)]) => {
                         let near = frames::load(self.run, frame)?;
-                        let (stands, place) =
-                            judge.second_look(&near, (*pixel, *half_px), odds, self.clicks.as_deref())?;
+                        let (stands, place) = judge.second_look(
+                            &near,
+                            (*pixel, *half_px),
+                            last.and_then(|f| f.plane),
+                            odds,
+                            self.clicks.as_deref(),
+                        )?;
                         let is = look::second_look_of(*found, place.as_ref());
                         (Kind::SecondLook, vec![(*found, stands)], Some(is), Some(&**was))
                     }

@@ -814,10 +814,10 @@ impl Way<'_> {
         } else {
             None
         };
-        let place = (center, half_px);
-        let (stands, place) = self
-            .judge()
-            .second_look(&near, place, self.face_odds(), clicks.as_deref())?;
+        let face = self.record.faces.last().and_then(|f| f.plane);
+        let (stands, place) =
+            self.judge()
+                .second_look(&near, (center, half_px), face, self.face_odds(), clicks.as_deref())?;
         self.budget(&near);
         let picture = self
             .runner

@@ -8,8 +8,11 @@ use crate::Corrections;
 
 /// The ring of the head's top around the recess, in head diameters.
 const TOP_RING: [f64; 2] = [0.24, 0.36];
-/// The ring of sheet around the head, in head diameters.
+/// No head rises farther above its sheet, in head diameters.
+const HIGHEST: f64 = 0.7;
+/// The ring of sheet around the head, in head diameters; and a narrower one for heads on a strip of sheet.
 const SHEET_RING: [f64; 2] = [0.75, 1.6];
+const STRIP_RING: [f64; 2] = [0.62, 1.0];
 /// Borders of the rings around the recess whose heights above the sheet tell the rim's, in head diameters.
 const RINGS: [f64; 8] = [0.0, 0.12, 0.20, 0.27, 0.34, 0.41, 0.48, 0.56];
 /// Heights in those rings, and the head's diameter.
@@ -73,10 +76,7 @@ pub fn locate(
     diameter_px: f64,
     corrections: &Corrections,
 ) -> Option<Located> {
-    let [inner, outer] = SHEET_RING.map(|r| r * diameter_px);
-    let sheet = depth
-        .plane_at(pixel, inner, outer)
-        .filter(|plane| believable(plane, camera, pixel))?;
+    let sheet = sheet(depth, camera, pixel, diameter_px)?;
     let head_mm = diameter_px * camera.pixel_mm(sheet.depth_mm);
     let profile = RimProfile::above(sheet, depth, pixel, head_mm, diameter_px);
     let (height_mm, sigma_depth_mm, source) = match &profile {
@@ -121,10 +121,9 @@ pub struct RimProfile {
 impl RimProfile {
     /// That of a head of this diameter; `None` where the sheet or most rings have no depth.
     pub fn of(depth: &DepthMap, camera: &CameraModel, pixel: Pixel, diameter_px: f64) -> Option<Self> {
-        let [inner, outer] = SHEET_RING.map(|r| r * diameter_px);
-        let sheet = depth.plane_at(pixel, inner, outer)?;
+        let sheet = sheet(depth, camera, pixel, diameter_px)?;
         let head_mm = diameter_px * camera.pixel_mm(sheet.depth_mm);
-        Self::above(sheet, depth, pixel, head_mm, diameter_px).filter(|_| believable(&sheet, camera, pixel))
+        Self::above(sheet, depth, pixel, head_mm, diameter_px)
     }
 
     fn above(sheet: SurfaceSample, depth: &DepthMap, pixel: Pixel, head_mm: f64, diameter_px: f64) -> Option<Self> {
@@ -133,7 +132,10 @@ impl RimProfile {
             let r = u.hypot(v) / diameter_px;
             if let Some(ring) = RINGS.windows(2).position(|border| (border[0]..border[1]).contains(&r)) {
                 let plane = sheet.depth_mm + sheet.slope_mm_per_px[0] * u + sheet.slope_mm_per_px[1] * v;
-                rings[ring].push(plane - z);
+                // what is higher hangs before the head: a cable
+                if plane - z < HIGHEST * head_mm {
+                    rings[ring].push(plane - z);
+                }
             }
         }
         let heights = rings.map(|mut heights| {
@@ -210,6 +212,34 @@ pub fn facings(depth: &DepthMap, camera: &CameraModel, heads: &[(Pixel, f64)]) -
 pub fn parallax_px(camera: &CameraModel, pixel: Pixel, normal: Direction<Camera>, diameter_px: f64) -> [f64; 2] {
     let (ray, n) = (camera.unproject(pixel, 1.0), normal.vector());
     [ray.x_mm() * n.z - n.x, ray.y_mm() * n.z - n.y].map(|shift| shift * diameter_px)
+}
+
+/// The sheet around a head. On a strip of sheet most of the usual ring is what lies behind it: its plane is far below the head, or a steep one
+/// through both. There the narrower ring says more.
+fn sheet(depth: &DepthMap, camera: &CameraModel, pixel: Pixel, diameter_px: f64) -> Option<SurfaceSample> {
+    let plane = |ring: [f64; 2]| {
+        let [inner, outer] = ring.map(|r| r * diameter_px);
+        depth
+            .plane_at(pixel, inner, outer)
+            .filter(|plane| believable(plane, camera, pixel))
+    };
+    let usual = plane(SHEET_RING);
+    let mut head: Vec<f64> = depth
+        .neighbourhood(pixel, 0.0, TOP_RING[1] * diameter_px)
+        .iter()
+        .map(|p| p[2])
+        .collect();
+    let middle = head.len() / 2;
+    let head_mm = (!head.is_empty()).then(|| *head.select_nth_unstable_by(middle, f64::total_cmp).1);
+    let is_under = |plane: &SurfaceSample| {
+        let along_axis = normal(plane, camera, pixel).map_or(0.0, |n| n.vector().z.abs());
+        let highest_mm = HIGHEST * diameter_px * camera.pixel_mm(plane.depth_mm);
+        along_axis > STEEPEST_SHEET.cos() && head_mm.is_none_or(|head_mm| plane.depth_mm - head_mm < highest_mm)
+    };
+    match usual {
+        Some(sheet) if is_under(&sheet) => Some(sheet),
+        _ => plane(STRIP_RING).filter(is_under).or(usual),
+    }
 }
 
 fn believable(plane: &SurfaceSample, camera: &CameraModel, pixel: Pixel) -> bool {
@@ -336,6 +366,39 @@ mod tests {
                 "{k}: {facing:?}"
             );
         }
+    }
+
+    #[test]
+    fn a_cable_before_a_part_of_a_head_is_not_taken_for_it() {
+        let (mut map, camera) = scene(|_| true);
+        for k in 0..map.depth_mm.len() {
+            let p = map.color_pixel(k as u32 % map.width, k as u32 / map.width);
+            let along = (p.u_px - AT.u_px) + 0.4 * (p.v_px - AT.v_px);
+            if (-0.2..0.35).contains(&(along / DIAMETER_PX)) {
+                map.depth_mm[k] = (RIM_MM - 9.0) as f32;
+            }
+        }
+        let found = locate(&map, &camera, AT, 0.2, DIAMETER_PX, &Corrections::default()).expect("depth all over");
+        assert!((found.point.z_mm() - RIM_MM).abs() < 0.8, "{found:?}");
+    }
+
+    #[test]
+    fn a_head_on_a_strip_of_sheet_is_located_on_it() {
+        // a strip not much wider than the head, and a plate 60 mm behind it
+        let (mut map, camera) = scene(|_| true);
+        for k in 0..map.depth_mm.len() {
+            let p = map.color_pixel(k as u32 % map.width, k as u32 / map.width);
+            if (p.u_px - AT.u_px).abs() > 0.8 * DIAMETER_PX {
+                map.depth_mm[k] += 60.0;
+            }
+        }
+        let found = locate(&map, &camera, AT, 0.2, DIAMETER_PX, &Corrections::default()).expect("depth all over");
+        assert!((found.point.z_mm() - RIM_MM).abs() < 0.5, "{found:?}");
+        let rise_mm = RimProfile::of(&map, &camera, AT, DIAMETER_PX)
+            .expect("depth all over")
+            .rise_mm();
+        assert!((1.0..3.5).contains(&rise_mm), "{rise_mm}");
+        assert!(found.normal.vector().z < -0.98, "{found:?}");
     }
 
     #[test]
