@@ -158,7 +158,7 @@ impl Default for Exclusion {
             review_max: 2,
             review_score_min: 0.3,
             face_tilt_max_rad: 8f64.to_radians(),
-            heads_lean_max_rad: 7f64.to_radians(),
+            heads_lean_max_rad: 8f64.to_radians(),
             screw_tilt_max_rad: 11f64.to_radians(),
             bent_max: 0,
         }

@@ -14,10 +14,10 @@ const LEAST_TRIANGLE_MM2: f64 = 1500.0;
 const CORNERS: usize = 20;
 /// Steps of the fit to the heads that agree.
 const FIT_STEPS: usize = 8;
-/// From so many heads on, the middle of how they lean says how they lean.
-const ENOUGH_HEADS: usize = 5;
-/// Share of the middle one's lean that each of fewer heads must have.
+/// Share of the middle one's lean that heads must have to lean together with it.
 const LEANS_TOO: f64 = 0.5;
+/// One of so many heads may lean otherwise: seated askew.
+const MAY_LEAN_APART: usize = 5;
 
 /// The plane that a face lies in: `normal` · point = `distance_mm`.
 #[derive(Clone, Copy, Debug)]
@@ -124,9 +124,9 @@ impl FaceFit {
         self.normal
     }
 
-    /// How far heads lean from the face together: one that is seated askew does not move the median. One head's top is measured to 3° (95 %
-    /// within 11°), and of three such measurements the median is still off by 10° now and then: of three or four heads, each has
-    /// to lean half as far to that side. `None` with fewer than three, or where one of a few does not.
+    /// How far heads lean from the face together: the middle one of them, if no more than one in five leans less than half as far to that side. One head's
+    /// top is measured to 3° (95 % within 11°), and the middle of a few such measurements is still off by 10° now and then.
+    /// `None` with fewer than three.
     pub fn lean_rad(&self, heads: impl Iterator<Item = Direction<Camera>>) -> Option<f64> {
         let heads: Vec<_> = heads.collect();
         if heads.len() < 3 {
@@ -137,8 +137,9 @@ impl FaceFit {
         let middle = Direction::from_vector(Vector3::new(axis(0), axis(1), axis(2)))?;
         let across = |n: &Direction<Camera>| n.vector() - face.vector() * n.vector().dot(&face.vector());
         let toward = across(&middle);
-        let together = |n: &Direction<Camera>| across(n).dot(&toward) >= LEANS_TOO * toward.norm_squared();
-        (heads.len() >= ENOUGH_HEADS || heads.iter().all(together)).then(|| middle.angle_rad(face))
+        let apart = |n: &&Direction<Camera>| across(n).dot(&toward) < LEANS_TOO * toward.norm_squared();
+        let together = heads.iter().filter(apart).count() <= heads.len() / MAY_LEAN_APART;
+        together.then(|| middle.angle_rad(face))
     }
 
     /// Depth of the plane at a pixel, mm.
@@ -375,7 +376,7 @@ mod tests {
     }
 
     #[test]
-    fn of_a_few_heads_each_must_lean_of_many_the_middle_one() {
+    fn heads_lean_together_if_hardly_one_leans_otherwise() {
         let camera = CameraModel::pinhole(800, 600, 900.0, 900.0);
         let straight = Direction::from_vector(-Vector3::z()).expect("not zero");
         let fit = FaceFit {
@@ -392,5 +393,6 @@ mod tests {
         assert_eq!(lean(&[12.0, 13.0, 2.0]), None);
         assert!(lean(&[12.0, 13.0, 8.0]).is_some_and(|l| (l - 12.0).abs() < 1e-6));
         assert!(lean(&[12.0, 13.0, 2.0, 12.0, 13.0]).is_some_and(|l| (l - 12.0).abs() < 1e-6));
+        assert_eq!(lean(&[12.0, 13.0, 2.0, -3.0, 13.0]), None);
     }
 }

@@ -106,7 +106,7 @@ pub struct FacePlane {
     /// Which way it looks, towards the camera; not in journals of versions before.
     #[serde(default)]
     pub normal: Option<Direction<Camera>>,
-    /// How far the heads of its screws lean from it together, rad; `None` with fewer than three, or where of a few not all do.
+    /// How far the heads of its screws lean from it together, rad; `None` with fewer than three, or where they do not lean together.
     #[serde(default)]
     pub heads_lean_rad: Option<f64>,
 }
