@@ -27,9 +27,9 @@ impl Way<'_> {
         let (found, mut place) = (target.found, target.place);
         self.log(Event::Recovery { on: true })?;
         while let Some(rung) = climb.next(cause, self.bursts(found)) {
-            // A head that may be none is looked at again, but not searched for.
-            let searches = cause == Cause::MissedHead && rung != Rung::LookAgain;
-            if searches && (self.is_doubtful(found) || self.score(found) < WORTH_A_SEARCH) {
+            // A head that may be none is looked at again, but not searched for; what is tried for its cover's sake alone is not even that.
+            let searches = rung != Rung::LookAgain && self.score(found) < WORTH_A_SEARCH;
+            if cause == Cause::MissedHead && (searches || self.is_doubtful(found)) {
                 break;
             }
             let end = match rung {

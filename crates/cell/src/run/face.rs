@@ -180,7 +180,8 @@ impl Way<'_> {
                         Err(error) => stop = Some(error),
                     }
                 }
-                Some(_) => tried.waits = true,
+                // what is tried for its cover's sake alone and is not met is no screw
+                Some(_) => tried.waits = cause != Cause::MissedHead || !self.is_doubtful(target.found),
             }
         }
         if let Some(screw) = trouble {
