@@ -175,8 +175,8 @@ pub struct Approach {
     pub approach_mm_s: f64,
     /// Speed back, mm/s.
     pub retract_mm_s: f64,
-    /// The sheet around a screw is followed instead of the whole face if it leans further from it than this, rad: below, the
-    /// face's plane is the better measurement.
+    /// The sheet around a screw is followed instead of the whole face if both it and the screw's head lean further from it than this, and alike,
+    /// rad: else the face's plane is the better measurement.
     pub local_normal_from_rad: f64,
     /// Age from which a map is not trusted any more, days since it was fitted, realigned or last passed a check.
     pub map_age_max_days: f64,

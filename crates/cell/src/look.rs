@@ -15,7 +15,7 @@ use serde::{Deserialize, Serialize};
 /// A cover is off if the sheet around its screws lies this much deeper than before, mm.
 const COVER_OFF_MM: f64 = 15.0;
 
-/// A click means the candidate whose middle lies within this share of its head's diameter.
+/// Two places nearer than this share of a head's diameter are of one head: a click and a candidate, a find and one of an earlier look.
 const SAME_HEAD: f64 = 0.6;
 /// Width that is taken for a head that only a person has seen, mm.
 const USUAL_HEAD_MM: f64 = 9.5;
@@ -158,7 +158,16 @@ impl Judge<'_> {
         let holes = seen
             .filter(|f| f.verdict == Verdict::Screw)
             .map(|f| (shot.to_shot(Pixel::new(f.u_px, f.v_px)), f.diameter_px));
-        let heads: Vec<(Pixel, f64)> = certain.chain(holes).collect();
+        let mut heads: Vec<(Pixel, f64)> = Vec::new();
+        for (pixel, diameter_px) in certain.chain(holes) {
+            // one that was seen twice has one say
+            if heads
+                .iter()
+                .all(|(other, _)| other.distance_px(&pixel) > SAME_HEAD * diameter_px)
+            {
+                heads.push((pixel, diameter_px));
+            }
+        }
         let fit = FaceFit::around(&shot.frame, &heads, config.inspection.working_depth_mm);
         plan::bound_doubtful(
             &mut screws,

@@ -23,12 +23,12 @@ const SAME_WAY_RAD: f64 = 5e-4;
 
 /// The screws of a face stand no farther in front of its plane or behind it, mm: ribs and sunk flanges.
 const ON_FACE_MM: f64 = 20.0;
-/// On a plate behind it that looks the same way no farther than this, mm.
+/// Or on a plate behind it that looks the same way, no farther than this, mm.
 const BEHIND_FACE_MM: f64 = 80.0;
-/// Sheet and head lean the same way if they lean no further from each other, rad.
-const SAME_LEAN_RAD: f64 = 0.07;
-/// How far the sheet of such a plate may lean from the face, rad.
+/// How far such a plate may lean from the face, rad.
 const SAME_WAY_AS_FACE_RAD: f64 = 0.06;
+/// Sheet and head lean alike if they lean no further from each other, rad.
+const SAME_LEAN_RAD: f64 = 0.07;
 
 /// A place that an arm may be sent to: the point and the straight way to it lie in the calibrated volume of that arm's map, and
 /// the whole way there is free.
@@ -436,7 +436,7 @@ fn target(
     {
         return Err(LeftAlone::Bent.into());
     }
-    let normal = line_of_approach(sheet, head_normal(screw), face, config).ok_or(LeftAlone::NoDepth)?;
+    let normal = line_of_approach(sheet, screw.top_normal, face, config).ok_or(LeftAlone::NoDepth)?;
     let mut refused = Refused::from(LeftAlone::HullOutside);
     let mut choices = Vec::new();
     for reach in arms {
@@ -484,7 +484,11 @@ fn line_of_approach(
     config: &CellConfig,
 ) -> Option<Direction<Camera>> {
     let Some(face) = face.map(FaceFit::normal) else {
-        return sheet.or(head);
+        // a plane through an edge leans more than the sheet does
+        return [sheet, head]
+            .into_iter()
+            .flatten()
+            .min_by(|a, b| tilt_rad(*a).total_cmp(&tilt_rad(*b)));
     };
     let leans = |normal: Direction<Camera>| normal.angle_rad(face) > config.approach.local_normal_from_rad;
     match (sheet, head) {

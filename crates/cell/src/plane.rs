@@ -12,6 +12,8 @@ const OFF_NORMAL_RAD: f64 = 0.07;
 const LEAST_TRIANGLE_MM2: f64 = 1500.0;
 /// Heads at most that triangles are made of.
 const CORNERS: usize = 20;
+/// No face is presented that looks farther aside, rad.
+const STEEPEST_FACE_RAD: f64 = 0.35;
 /// Steps of the fit to the heads that agree.
 const FIT_STEPS: usize = 8;
 /// Share of the middle one's lean that heads must have to lean together with it.
@@ -76,7 +78,7 @@ impl FaceFit {
 
     /// The plane that the screws of a face sit in: the one in which most heads lie and along whose normal the sheet around most heads looks. Where
     /// much of what shows lies behind the flanges (an open front, a grille), the plane of most of the depth is not the face's; with fewer than
-    /// three heads there is nothing else.
+    /// three heads, or where they do not agree, there is nothing else.
     ///
     /// # Arguments
     /// * `heads` – centres of the finds in the picture with the diameters of their heads, px.
@@ -98,6 +100,7 @@ impl FaceFit {
             planes
                 .min_by(|a, b| cost(a).total_cmp(&cost(b)))
                 .and_then(|(normal, distance)| refined(&sheets, normal, distance))
+                .filter(|(normal, distance)| is_borne_out(&sheets, &normal.vector(), *distance))
         };
         match fit {
             Some((normal, distance_mm)) => Some(Self {
@@ -159,7 +162,7 @@ impl FaceFit {
     }
 }
 
-/// Planes that the heads of a face may sit in: through each head along the normal of any, and through every three.
+/// Planes that the heads of a face may sit in: through each head along the normal of any, and through every three of the first ones.
 fn planes_through(sheets: &[Sheet]) -> Vec<(Vector3<f64>, f64)> {
     let axis = |a: usize| median(sheets.iter().map(|s| s.normal[a]));
     let middle = Vector3::new(axis(0), axis(1), axis(2));
@@ -172,7 +175,8 @@ fn planes_through(sheets: &[Sheet]) -> Vec<(Vector3<f64>, f64)> {
         for (j, b) in corners[..k].iter().enumerate() {
             for a in &corners[..j] {
                 let across = (b.at - a.at).cross(&(c.at - a.at));
-                let normal = if across.z > 0.0 { -across } else { across } / across.norm().max(1e-9);
+                let towards_camera = if across.z > 0.0 { -across } else { across };
+                let normal = towards_camera / across.norm().max(1e-9);
                 if across.norm() >= 2.0 * LEAST_TRIANGLE_MM2 {
                     planes.push((normal, normal.dot(&a.at)));
                 }
@@ -180,6 +184,14 @@ fn planes_through(sheets: &[Sheet]) -> Vec<(Vector3<f64>, f64)> {
         }
     }
     planes
+}
+
+/// True if at least three heads lie in a plane and the sheet around two of them looks along its normal, as far as any face looks aside.
+fn is_borne_out(sheets: &[Sheet], normal: &Vector3<f64>, distance: f64) -> bool {
+    let lies_in = |sheet: &&Sheet| (normal.dot(&sheet.at) - distance).abs() < OFF_PLANE_MM;
+    let looks_along = |sheet: &&Sheet| (normal - sheet.normal).norm() < OFF_NORMAL_RAD;
+    let in_it = sheets.iter().filter(lies_in);
+    in_it.clone().count() >= 3 && in_it.filter(looks_along).count() >= 2 && -normal.z > STEEPEST_FACE_RAD.cos()
 }
 
 /// How little heads and a plane agree: squares of how far each head lies off it and leans from it, those that disagree alike.

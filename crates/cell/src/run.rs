@@ -997,10 +997,19 @@ impl Way<'_> {
             let Some(last) = self.record.faces.iter().rev().find(|f| f.face == *face) else {
                 continue;
             };
+            // what was tried for the cover's sake alone and not met is no screw
+            let odds = look::odds(&self.runner.config, last.purpose);
+            let is_none = |a: &&ScrewAttempt| {
+                let doubtful = last
+                    .found
+                    .get(a.found)
+                    .is_some_and(|f| plan::is_doubtful(f.score, odds));
+                doubtful && a.end() == Some(DriveEnd::MissedHead)
+            };
             let failed = last
                 .attempts
                 .iter()
-                .find(|a| !a.removed() && a.still_there != Some(false) && counts(a.end()));
+                .find(|a| !a.removed() && a.still_there != Some(false) && counts(a.end()) && !is_none(a));
             if let Some(attempt) = failed {
                 let (reason, what) = match attempt.end() {
                     Some(DriveEnd::Seized) => (NgReason::ScrewSeized, "did not turn"),

@@ -41,7 +41,8 @@ fn main() -> Result<(), ModelError> {
                 t_s: 0.0,
             };
             let found = detector.detect(&frame, &Options::default()).screws;
-            let certain = found.iter().filter(|s| s.verdict != Verdict::Review);
+            let is_certain = |s: &&vision::Screw| !cell::plan::is_doubtful(s.fits, 1.0) || s.verdict == Verdict::Other;
+            let certain = found.iter().filter(is_certain);
             let heads: Vec<_> = certain.map(|s| (s.pixel, s.diameter_px)).collect();
             let Some(fit) = FaceFit::around(&frame, &heads, WORKING_DEPTH_MM) else {
                 continue;

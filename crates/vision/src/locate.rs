@@ -10,6 +10,8 @@ use crate::Corrections;
 const TOP_RING: [f64; 2] = [0.24, 0.36];
 /// No head rises farther above its sheet, in head diameters.
 const HIGHEST: f64 = 0.7;
+/// Of a head behind a cable at least one in so many measurements is of the head.
+const SHOWS: usize = 5;
 /// The ring of sheet around the head, in head diameters; and a narrower one for heads on a strip of sheet.
 const SHEET_RING: [f64; 2] = [0.75, 1.6];
 const STRIP_RING: [f64; 2] = [0.62, 1.0];
@@ -127,15 +129,23 @@ impl RimProfile {
     }
 
     fn above(sheet: SurfaceSample, depth: &DepthMap, pixel: Pixel, head_mm: f64, diameter_px: f64) -> Option<Self> {
-        let mut rings: [Vec<f64>; RIM_TERMS - 1] = Default::default();
-        for [u, v, z] in depth.neighbourhood(pixel, 0.0, RINGS[RIM_TERMS - 1] * diameter_px) {
-            let r = u.hypot(v) / diameter_px;
-            if let Some(ring) = RINGS.windows(2).position(|border| (border[0]..border[1]).contains(&r)) {
+        let points = depth.neighbourhood(pixel, 0.0, RINGS[RIM_TERMS - 1] * diameter_px);
+        let heights: Vec<(f64, f64)> = points
+            .iter()
+            .map(|[u, v, z]| {
                 let plane = sheet.depth_mm + sheet.slope_mm_per_px[0] * u + sheet.slope_mm_per_px[1] * v;
-                // what is higher hangs before the head: a cable
-                if plane - z < HIGHEST * head_mm {
-                    rings[ring].push(plane - z);
-                }
+                (u.hypot(*v) / diameter_px, plane - z)
+            })
+            .collect();
+        // what is higher than a head hangs before it, a cable; if all is, the head stands on something before that sheet
+        let is_head = |height_mm: f64| height_mm < HIGHEST * head_mm;
+        let shows = heights.iter().filter(|(_, height_mm)| is_head(*height_mm)).count() >= heights.len() / SHOWS;
+        let mut rings: [Vec<f64>; RIM_TERMS - 1] = Default::default();
+        for (r, height_mm) in heights {
+            if let Some(ring) = RINGS.windows(2).position(|border| (border[0]..border[1]).contains(&r))
+                && (is_head(height_mm) || !shows)
+            {
+                rings[ring].push(height_mm);
             }
         }
         let heights = rings.map(|mut heights| {
@@ -230,11 +240,11 @@ fn sheet(depth: &DepthMap, camera: &CameraModel, pixel: Pixel, diameter_px: f64)
         .map(|p| p[2])
         .collect();
     let middle = head.len() / 2;
-    let head_mm = (!head.is_empty()).then(|| *head.select_nth_unstable_by(middle, f64::total_cmp).1);
+    let top_mm = (!head.is_empty()).then(|| *head.select_nth_unstable_by(middle, f64::total_cmp).1);
     let is_under = |plane: &SurfaceSample| {
         let along_axis = normal(plane, camera, pixel).map_or(0.0, |n| n.vector().z.abs());
         let highest_mm = HIGHEST * diameter_px * camera.pixel_mm(plane.depth_mm);
-        along_axis > STEEPEST_SHEET.cos() && head_mm.is_none_or(|head_mm| plane.depth_mm - head_mm < highest_mm)
+        along_axis > STEEPEST_SHEET.cos() && top_mm.is_none_or(|top_mm| plane.depth_mm - top_mm < highest_mm)
     };
     match usual {
         Some(sheet) if is_under(&sheet) => Some(sheet),
@@ -380,6 +390,20 @@ mod tests {
         }
         let found = locate(&map, &camera, AT, 0.2, DIAMETER_PX, &Corrections::default()).expect("depth all over");
         assert!((found.point.z_mm() - RIM_MM).abs() < 0.8, "{found:?}");
+    }
+
+    #[test]
+    fn a_head_far_before_all_that_is_measured_around_it_is_located_where_it_is() {
+        // a stud: nothing of its sheet shows
+        let (mut map, camera) = scene(|_| true);
+        for k in 0..map.depth_mm.len() {
+            let p = map.color_pixel(k as u32 % map.width, k as u32 / map.width);
+            if p.distance_px(&AT) > 0.52 * DIAMETER_PX {
+                map.depth_mm[k] += 60.0;
+            }
+        }
+        let found = locate(&map, &camera, AT, 0.2, DIAMETER_PX, &Corrections::default()).expect("depth all over");
+        assert!((found.point.z_mm() - RIM_MM).abs() < 3.0, "{found:?}");
     }
 
     #[test]

@@ -6,9 +6,9 @@ use crate::device::{DeviceError, DriveEnd, DriveProgram, Question, TagValue, tag
 use crate::ladder::{Cause, Climb, Rung};
 use crate::plan::{SafeTarget, Target};
 use crate::policy::{Case, Choice};
-use crate::record::{Event, Verdict};
+use crate::record::{Event, FaceRecord, Purpose, Verdict};
 
-/// A head is searched around if the picture alone makes it a screw with so much probability.
+/// A head is searched around if it is a screw with so much probability.
 const WORTH_A_SEARCH: f64 = 0.9;
 
 impl Way<'_> {
@@ -26,11 +26,14 @@ impl Way<'_> {
         let first = self.runner.config.drive.first;
         let (found, mut place) = (target.found, target.place);
         self.log(Event::Recovery { on: true })?;
+        let mut not_met = false;
         while let Some(rung) = climb.next(cause, self.bursts(found)) {
-            // A head that may be none is looked at again, but not searched for; what is tried for its cover's sake alone is not even that.
-            let searches = rung != Rung::LookAgain && self.score(found) < WORTH_A_SEARCH;
-            if cause == Cause::MissedHead && (searches || self.is_doubtful(found)) {
+            // What is tried for its cover's sake alone and is not met is none; what else may be none is looked at again, but not searched for.
+            if not_met && self.is_doubtful(found) {
                 break;
+            }
+            if matches!(rung, Rung::Search { .. }) && !self.is_worth_a_search(found) {
+                continue;
             }
             let end = match rung {
                 Rung::Drive { program } if rung.is_destructive() => match self.mill(found, place, program).await? {
@@ -51,6 +54,7 @@ impl Way<'_> {
                     self.burst(found, place, first, Some(picture)).await?
                 }
             };
+            not_met = end == Some(DriveEnd::MissedHead);
             match Cause::of(end) {
                 Some(next) => cause = next,
                 None => break,
@@ -65,10 +69,11 @@ impl Way<'_> {
         attempts.filter(|a| a.found == found).map(|a| a.bursts.len()).sum()
     }
 
-    /// How probably a find of the face that is being worked on is a screw.
-    fn score(&self, found: usize) -> f64 {
-        let find = self.record.faces.last().and_then(|f| f.found.get(found));
-        find.map_or(0.0, |find| find.score)
+    /// True if a find of the face that is being worked on is a screw with enough probability, or a person's word.
+    fn is_worth_a_search(&self, found: usize) -> bool {
+        let find = |face: &FaceRecord| face.found.get(found).map_or(0.0, |find| find.score);
+        let face = self.record.faces.last();
+        face.is_some_and(|face| face.purpose == Purpose::Clicked || find(face) >= WORTH_A_SEARCH)
     }
 
     /// Drives at places on a ring, until the bit meets something.

@@ -4,7 +4,7 @@
 use super::{Stop, Way};
 use crate::capture::Shot;
 use crate::config::CellConfig;
-use crate::device::{Bit, DeviceError, Devices, DriveProgram};
+use crate::device::{Bit, DeviceError, Devices, DriveEnd, DriveProgram};
 use crate::journal::JournalError;
 use crate::ladder::{Cause, Climb, Rung};
 use crate::motion::ArmMotion;
@@ -150,6 +150,8 @@ impl Way<'_> {
                 Cause::of(ended.end),
                 ended.error.is_some(),
             );
+            // what is tried for its cover's sake alone and is not met is no screw
+            let is_none = ended.end == Some(DriveEnd::MissedHead) && self.is_doubtful(target.found);
             self.end_burst(target, ended)?;
             if failed && self.is_in_trouble(target).await {
                 trouble = Some(screw);
@@ -180,8 +182,7 @@ impl Way<'_> {
                         Err(error) => stop = Some(error),
                     }
                 }
-                // what is tried for its cover's sake alone and is not met is no screw
-                Some(_) => tried.waits = cause != Cause::MissedHead || !self.is_doubtful(target.found),
+                Some(_) => tried.waits = !is_none,
             }
         }
         if let Some(screw) = trouble {
