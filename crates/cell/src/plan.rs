@@ -23,8 +23,8 @@ const SAME_WAY_RAD: f64 = 5e-4;
 
 /// The screws of a face stand no farther in front of its plane or behind it, mm: ribs and sunk flanges.
 const ON_FACE_MM: f64 = 20.0;
-/// Or on a plate behind it that looks the same way, no farther than this, mm.
-const BEHIND_FACE_MM: f64 = 80.0;
+/// Or on a plate that looks the same way, no farther from it than this, mm.
+const PLATES_MM: f64 = 80.0;
 /// How far such a plate may lean from the face, rad.
 const SAME_WAY_AS_FACE_RAD: f64 = 0.06;
 /// Sheet and head lean alike if they lean no further from each other, rad.
@@ -297,7 +297,7 @@ pub fn is_doubtful(fits: f64, odds: f64) -> bool {
 /// # Arguments
 /// * `before` – finds of the same face when it was looked at without the odds: what was in doubt then and is now is likelier than
 ///   what one of two pictures shows.
-/// * `face` – where the face lies: what is deep behind it, and not on a plate that looks the same way, is a gap of a grille.
+/// * `face` – where the face lies: what is far from it, and not on a plate that looks the same way, is a gap of a grille.
 pub fn bound_doubtful(
     screws: &mut [vision::Screw],
     odds: f64,
@@ -310,12 +310,12 @@ pub fn bound_doubtful(
         let (Some(face), Some(at)) = (face, screw.camera) else {
             return false; // no depth, no target
         };
-        let behind_mm = at.z_mm() - face.depth_mm(screw.pixel);
+        let off_mm = (at.z_mm() - face.depth_mm(screw.pixel)).abs();
         let looks_the_same_way = || {
             let sheet = sheet_normal(frame, screw.pixel, screw.diameter_px);
             sheet.is_some_and(|sheet| sheet.angle_rad(face.normal()) <= SAME_WAY_AS_FACE_RAD)
         };
-        behind_mm.abs() <= ON_FACE_MM || (0.0..=BEHIND_FACE_MM).contains(&behind_mm) && looks_the_same_way()
+        off_mm <= ON_FACE_MM || off_mm <= PLATES_MM && looks_the_same_way()
     };
     let seen_before = |screw: &vision::Screw| {
         let near = |f: &&Found| (f.u_px - screw.pixel.u_px).hypot(f.v_px - screw.pixel.v_px) < screw.diameter_px;

@@ -92,16 +92,13 @@ impl FaceFit {
             })
         };
         let sheets: Vec<Sheet> = heads.iter().filter_map(sheet).collect();
-        let fit = if sheets.len() < 3 {
-            None
-        } else {
-            let cost = |(normal, distance): &(Vector3<f64>, f64)| disagreement(&sheets, normal, *distance);
-            let planes = planes_through(&sheets).into_iter();
-            planes
-                .min_by(|a, b| cost(a).total_cmp(&cost(b)))
-                .and_then(|(normal, distance)| refined(&sheets, normal, distance))
-                .filter(|(normal, distance)| is_borne_out(&sheets, &normal.vector(), *distance))
-        };
+        let cost = |(normal, distance): &(Vector3<f64>, f64)| disagreement(&sheets, normal, *distance);
+        let best = planes_through(&sheets)
+            .into_iter()
+            .min_by(|a, b| cost(a).total_cmp(&cost(b)));
+        let fit = best
+            .and_then(|(normal, distance)| refined(&sheets, normal, distance))
+            .filter(|(normal, distance)| is_borne_out(&sheets, &normal.vector(), *distance));
         match fit {
             Some((normal, distance_mm)) => Some(Self {
                 normal,
