@@ -412,7 +412,7 @@ mod tests {
         let (mut map, camera) = scene(|_| true);
         for k in 0..map.depth_mm.len() {
             let p = map.color_pixel(k as u32 % map.width, k as u32 / map.width);
-            if (p.u_px - AT.u_px).abs() > 0.8 * DIAMETER_PX {
+            if (p.u_px - AT.u_px).abs() > 0.68 * DIAMETER_PX {
                 map.depth_mm[k] += 60.0;
             }
         }
