@@ -111,6 +111,8 @@ pub struct Inspection {
     /// How much likelier a doubtful head is a screw once the cover that it may hold has not come off: a missed screw always holds
     /// it, and of covers without one about one in 150 jams.
     pub stuck_cover_odds: f64,
+    /// The same once everything likelier has been tried, and a person, if one may be asked, has been: only what is surely something else is left.
+    pub last_try_odds: f64,
     /// Heads at most that are tried on such a face for no other reason, the likeliest first.
     pub doubtful_max: usize,
     /// Time that is budgeted for computing on a picture, s per megapixel. Only a simulated clock needs it.
@@ -126,6 +128,7 @@ impl Default for Inspection {
             second_look_mm: 32.0,
             same_screw_mm: 4.0,
             stuck_cover_odds: 150.0,
+            last_try_odds: 10_000.0,
             doubtful_max: 6,
             vision_s_per_mpx: 0.02,
         }
@@ -144,9 +147,9 @@ pub struct Exclusion {
     pub review_score_min: f64,
     /// Largest tilt of a face against the camera's axis, rad: ±6° by specification, and 2° for the measurement.
     pub face_tilt_max_rad: f64,
-    /// Largest lean of a face's screws together against the face, rad: beyond, the bit slips out of them.
+    /// Largest lean of a face's screws together against the face, rad: so far the bit follows them.
     pub heads_lean_max_rad: f64,
-    /// Largest tilt of the sheet around a screw against the camera's axis, rad.
+    /// Largest tilt of the sheet around a screw against the camera's axis, rad: so far the bit follows it.
     pub screw_tilt_max_rad: f64,
     /// Screws of a face that may sit on sheet bent beyond that before it is excluded.
     pub bent_max: usize,
@@ -158,8 +161,8 @@ impl Default for Exclusion {
             review_max: 2,
             review_score_min: 0.3,
             face_tilt_max_rad: 8f64.to_radians(),
-            heads_lean_max_rad: 8f64.to_radians(),
-            screw_tilt_max_rad: 11f64.to_radians(),
+            heads_lean_max_rad: 20f64.to_radians(),
+            screw_tilt_max_rad: 20f64.to_radians(),
             bent_max: 0,
         }
     }

@@ -87,7 +87,8 @@ impl Digest {
         let first = |a: &&&ScrewAttempt| a.bursts.first().and_then(|b| b.end) == Some(DriveEnd::Removed);
         let removed = attempts.iter().filter(|a| a.removed()).count();
         let out_at_once = attempts.iter().filter(|a| a.removed()).filter(first).count();
-        let missed = record.faces.iter().filter(|f| f.purpose == Purpose::Missed);
+        let missed = record.faces.iter();
+        let missed = missed.filter(|f| matches!(f.purpose, Purpose::Missed | Purpose::LastTry));
         Self {
             unit: record.unit,
             outcome: record.outcome.clone(),

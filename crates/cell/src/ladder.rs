@@ -80,7 +80,7 @@ impl Default for Ladder {
         let longer = |max_time_s, max_torque_nm| DriveProgram {
             max_time_s,
             max_torque_nm,
-            ..pressed(200.0, Bit::Cross)
+            ..pressed(400.0, Bit::Cross)
         };
         let mill = DriveProgram {
             axial_force_n: 80.0,
@@ -93,9 +93,13 @@ impl Default for Ladder {
             places: 6,
             radius_mm: 0.8,
         };
+        let farther = Rung::Search {
+            places: 8,
+            radius_mm: 1.5,
+        };
         Self {
             // looking comes before searching: around what is no screw there is nothing to find
-            missed_head: vec![Rung::LookAgain, search, Rung::Click],
+            missed_head: vec![Rung::LookAgain, search, Rung::Click, farther],
             cam_out: vec![
                 drive(pressed(250.0, Bit::Cross)),
                 drive(pressed(400.0, Bit::Cross)),
@@ -103,10 +107,16 @@ impl Default for Ladder {
                 drive(pressed(400.0, Bit::Extractor)),
                 drive(mill),
             ],
-            seized: vec![drive(longer(6.0, 18.0)), drive(longer(10.0, 22.0)), drive(mill)],
+            seized: vec![
+                drive(longer(6.0, 18.0)),
+                drive(longer(10.0, 22.0)),
+                drive(longer(10.0, 22.0)),
+                drive(longer(10.0, 22.0)),
+                drive(mill),
+            ],
             time_out: vec![Rung::LookAgain, drive(longer(6.0, 18.0))],
             still_there: vec![Rung::LookAgain, search, drive(longer(6.0, 18.0))],
-            bursts_max: 14,
+            bursts_max: 20,
         }
     }
 }

@@ -7,7 +7,7 @@ use crate::device::DeviceError;
 use crate::plan::{self, Reach, SafeTarget, Target};
 use crate::plane::{FaceFit, sheet_depth_mm, sheet_normal};
 use crate::program::{FaceId, Step};
-use crate::record::{ExclusionReason, FacePlane, FaceRecord, Found, PullEnd, Purpose, UnitRecord, Verdict};
+use crate::record::{ExclusionReason, FacePlane, FaceRecord, Found, LeftAlone, PullEnd, Purpose, UnitRecord, Verdict};
 use crate::run::Finder;
 use geometry::{Base, CameraModel, Direction, Pixel, Point, RgbdFrame};
 use serde::{Deserialize, Serialize};
@@ -19,6 +19,8 @@ const COVER_OFF_MM: f64 = 15.0;
 const SAME_HEAD: f64 = 0.6;
 /// Width that is taken for a head that only a person has seen, mm.
 const USUAL_HEAD_MM: f64 = 9.5;
+/// Height of its recess's rim above the sheet, mm.
+const USUAL_RIM_MM: f64 = 2.5;
 /// The same in a picture, px.
 const USUAL_HEAD_PX: f64 = 30.0;
 /// Standard error of a click, px.
@@ -145,19 +147,33 @@ impl Judge<'_> {
             clicks,
         } = *question;
         let odds = self.odds(purpose);
-        let screws = self.finder.find(&shot.frame, odds)?;
-        let mut screws = clicked_on(shot, screws, clicks.unwrap_or_default());
+        let looks = || so_far.faces.iter().filter(|f| f.face == *face);
+        let at = |f: &Found| shot.to_shot(Pixel::new(f.u_px, f.v_px));
+        let not_met: Vec<Pixel> = looks().flat_map(FaceRecord::not_met).map(at).collect();
+        let is_not_met = |s: &vision::Screw| {
+            not_met
+                .iter()
+                .any(|p| p.distance_px(&s.pixel) < SAME_HEAD * s.diameter_px)
+        };
+        let mut screws = self.finder.find(&shot.frame, odds)?;
+        // what the bit did not meet is not driven at again in the same place
+        for screw in screws
+            .iter_mut()
+            .filter(|s| s.verdict == Verdict::Screw && is_not_met(s))
+        {
+            screw.verdict = Verdict::Review;
+        }
+        let mut screws = clicked_on(shot, screws, clicks.unwrap_or_default(), is_not_met);
         let certain = screws
             .iter()
             .filter(|s| !plan::is_doubtful(s.fits, odds) || s.verdict == Verdict::Other);
         let certain = certain.map(|s| (s.pixel, s.diameter_px));
-        let before = so_far.faces.iter().rev().find(|f| f.face == *face);
-        let before = before.map_or(&[][..], |f| &f.found);
+        let before = looks().last().map_or(&[][..], |f| &f.found);
         // what is left of a face that has been worked on are its holes: the sheet around them is the face
-        let seen = so_far.faces.iter().filter(|f| f.face == *face).flat_map(|f| &f.found);
-        let holes = seen
+        let holes = looks()
+            .flat_map(|f| &f.found)
             .filter(|f| f.verdict == Verdict::Screw)
-            .map(|f| (shot.to_shot(Pixel::new(f.u_px, f.v_px)), f.diameter_px));
+            .map(|f| (at(f), f.diameter_px));
         let mut heads: Vec<(Pixel, f64)> = Vec::new();
         for (pixel, diameter_px) in certain.chain(holes) {
             // one that was seen twice has one say
@@ -177,15 +193,20 @@ impl Judge<'_> {
             fit.as_ref(),
             &shot.frame,
         );
-        let (found, targets) = plan::plan(&screws, shot, fit.as_ref(), &self.reaches, config);
-        let heads = screws
+        // where most screws are out already, they have told which way those that are left look
+        let told = || looks().filter_map(|f| f.plane?.heads_normal).last();
+        let tops = screws
             .iter()
-            .filter(|s| s.verdict == Verdict::Screw)
-            .filter_map(|s| s.top_normal);
-        let plane = fit.as_ref().map(|fit| FacePlane {
-            heads_lean_rad: fit.lean_rad(heads),
-            ..fit.plane()
-        });
+            .filter(|s| s.verdict == Verdict::Screw && !plan::is_doubtful(s.fits, odds));
+        let tops = tops.filter_map(|s| s.top_normal);
+        let fit = fit.map(|fit| fit.with_heads(fit.look_together(tops).or_else(told)));
+        let (mut found, targets) = plan::plan(&screws, shot, fit.as_ref(), &self.reaches, config);
+        let seen_but_not_met =
+            |s: &vision::Screw| s.verdict == Verdict::Review && !plan::is_doubtful(s.fits, odds) && is_not_met(s);
+        for (find, _) in found.iter_mut().zip(&screws).filter(|(_, s)| seen_but_not_met(s)) {
+            find.left_alone = Some(LeftAlone::NotMet);
+        }
+        let plane = fit.as_ref().map(FaceFit::plane);
         let seen = FaceRecord {
             step: index,
             step_name: step.name.clone(),
@@ -206,7 +227,7 @@ impl Judge<'_> {
         } else {
             0
         };
-        let excluded = if touched || matches!(purpose, Purpose::Missed | Purpose::Clicked) {
+        let excluded = if touched || !matches!(purpose, Purpose::Survey | Purpose::Work) {
             None
         } else {
             plan::exclusion(&seen, least, config)
@@ -238,7 +259,8 @@ impl Judge<'_> {
         clicks: Option<&[[f64; 2]]>,
     ) -> Result<(bool, Option<SafeTarget>), DeviceError> {
         let screws = self.finder.find(&near.frame, odds)?;
-        let screws = clicked_on(near, screws, clicks.unwrap_or_default());
+        // a person is asked where the bit has not met what the picture shows
+        let screws = clicked_on(near, screws, clicks.unwrap_or_default(), |_| true);
         let same_px = self.same_px(half_px);
         let off = |s: &vision::Screw| near.to_whole(s.pixel).distance_px(&center);
         let closest = screws
@@ -282,14 +304,16 @@ impl Judge<'_> {
 pub fn odds(config: &CellConfig, purpose: Purpose) -> f64 {
     match purpose {
         Purpose::Missed => config.inspection.stuck_cover_odds,
+        Purpose::LastTry => config.inspection.last_try_odds,
         Purpose::Survey | Purpose::Work | Purpose::Clicked => 1.0,
     }
 }
 
-/// The same when a screw is looked at again: what a person has clicked on is not doubted for its picture's sake.
+/// The same when a screw is looked at again: what a person has clicked on is not doubted for its picture's sake, and with the odds of a last try every
+/// hole would be a screw that still stands.
 pub fn odds_again(config: &CellConfig, purpose: Purpose) -> f64 {
     match purpose {
-        Purpose::Clicked => config.inspection.stuck_cover_odds,
+        Purpose::Clicked | Purpose::LastTry => config.inspection.stuck_cover_odds,
         other => odds(config, other),
     }
 }
@@ -330,7 +354,15 @@ pub fn cover_off(now: &RgbdFrame, before: Option<&FaceRecord>) -> PullEnd {
 }
 
 /// What is a screw once a person has clicked.
-fn clicked_on(shot: &Shot, mut screws: Vec<vision::Screw>, clicks: &[[f64; 2]]) -> Vec<vision::Screw> {
+///
+/// # Arguments
+/// * `is_not_met` – true of finds that the bit has not met: what a person shows there is where the person shows it.
+fn clicked_on(
+    shot: &Shot,
+    mut screws: Vec<vision::Screw>,
+    clicks: &[[f64; 2]],
+    is_not_met: impl Fn(&vision::Screw) -> bool,
+) -> Vec<vision::Screw> {
     for click in clicks {
         let pixel = shot.to_shot(Pixel::new(click[0], click[1]));
         let near = screws
@@ -338,7 +370,12 @@ fn clicked_on(shot: &Shot, mut screws: Vec<vision::Screw>, clicks: &[[f64; 2]]) 
             .filter(|s| s.pixel.distance_px(&pixel) < SAME_HEAD * s.diameter_px)
             .min_by(|a, b| a.pixel.distance_px(&pixel).total_cmp(&b.pixel.distance_px(&pixel)));
         match near {
-            Some(screw) => screw.verdict = Verdict::Screw,
+            Some(screw) => {
+                if let Some(shown) = is_not_met(screw).then(|| seen_by_a_person(shot, pixel)).flatten() {
+                    *screw = shown;
+                }
+                screw.verdict = Verdict::Screw;
+            }
             None => screws.extend(seen_by_a_person(shot, pixel)),
         }
     }
@@ -351,7 +388,7 @@ fn seen_by_a_person(shot: &Shot, pixel: Pixel) -> Option<vision::Screw> {
     // how wide it is in the picture depends on how far away it is, which is measured around it
     let roughly_mm = sheet_depth_mm(&shot.frame, pixel, USUAL_HEAD_PX)?;
     let around_px = USUAL_HEAD_MM / camera.pixel_mm(roughly_mm).max(1e-6);
-    let depth_mm = sheet_depth_mm(&shot.frame, pixel, around_px)?;
+    let depth_mm = sheet_depth_mm(&shot.frame, pixel, around_px)? - USUAL_RIM_MM;
     Some(vision::Screw {
         pixel,
         sigma_px: CLICK_PX,

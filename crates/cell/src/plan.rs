@@ -475,22 +475,26 @@ fn leaning(sheet: Option<Direction<Camera>>, head: Option<Direction<Camera>>) ->
     }
 }
 
-/// The normal that the bit follows: the face's plane, which is measured best, unless the sheet around the screw and its head both lean from it, and
-/// the same way.
+/// The normal that the bit follows: the face's plane, which is measured best, unless all heads on it lean from it together (a bent cover: they tell more
+/// than one of them), or the sheet around the screw and its head both do, and the same way (a dent).
 fn line_of_approach(
     sheet: Option<Direction<Camera>>,
     head: Option<Direction<Camera>>,
     face: Option<&FaceFit>,
     config: &CellConfig,
 ) -> Option<Direction<Camera>> {
-    let Some(face) = face.map(FaceFit::normal) else {
+    let Some(fit) = face else {
         // a plane through an edge leans more than the sheet does
         return [sheet, head]
             .into_iter()
             .flatten()
             .min_by(|a, b| tilt_rad(*a).total_cmp(&tilt_rad(*b)));
     };
+    let face = fit.normal();
     let leans = |normal: Direction<Camera>| normal.angle_rad(face) > config.approach.local_normal_from_rad;
+    if let Some(heads) = fit.heads().filter(|heads| leans(*heads)) {
+        return Some(heads);
+    }
     match (sheet, head) {
         (Some(sheet), Some(head)) if leans(sheet) && leans(head) && sheet.angle_rad(head) <= SAME_LEAN_RAD => {
             Some(sheet)
@@ -510,7 +514,7 @@ pub fn exclusion(face: &FaceRecord, least_screws: usize, config: &CellConfig) ->
             format!("{name}: the face leans by {tilt:.1}°, more than {most:.1}°"),
         ));
     }
-    let leaning = face.plane.and_then(|plane| plane.heads_lean_rad);
+    let leaning = face.plane.and_then(|plane| plane.heads_lean_rad());
     if let Some(lean) = leaning.filter(|lean| *lean > rules.heads_lean_max_rad) {
         let (lean, most) = (lean.to_degrees(), rules.heads_lean_max_rad.to_degrees());
         return Some((
@@ -581,7 +585,7 @@ mod tests {
             depth_mm: 1500.0,
             tilt_rad: 0.0,
             normal: towards(0.0),
-            heads_lean_rad: None,
+            heads_normal: None,
         };
         let face = FaceFit::known(&plane, camera).expect("known");
         let config = CellConfig::simulated();
@@ -593,5 +597,31 @@ mod tests {
         assert_eq!(line(60.0, 9.0), 0.0, "a plane through an edge");
         assert_eq!(line(4.0, 4.0), 0.0, "no more than the measurement");
         assert_eq!(line(9.0, -8.0), 0.0);
+    }
+
+    #[test]
+    fn on_a_bent_cover_the_bit_follows_what_all_heads_say() {
+        let towards = |degrees: f64| {
+            let (sin, cos) = degrees.to_radians().sin_cos();
+            Direction::<Camera>::new(sin, 0.0, -cos)
+        };
+        let camera = geometry::CameraModel::pinhole(800, 600, 900.0, 900.0);
+        let line = |heads: f64, own: f64| {
+            let plane = crate::record::FacePlane {
+                depth_mm: 1500.0,
+                tilt_rad: 0.0,
+                normal: towards(0.0),
+                heads_normal: towards(heads),
+            };
+            let face = FaceFit::known(&plane, camera).expect("known");
+            let sheet = towards(0.0);
+            let line = line_of_approach(sheet, towards(own), Some(&face), &CellConfig::simulated());
+            line.expect("a line").angle_rad(face.normal()).to_degrees()
+        };
+        assert!(
+            (line(13.0, 4.0) - 13.0).abs() < 1e-6,
+            "one head alone is measured badly"
+        );
+        assert_eq!(line(4.0, 9.0), 0.0, "no more than the measurement");
     }
 }

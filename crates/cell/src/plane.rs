@@ -27,6 +27,8 @@ pub struct FaceFit {
     /// Towards the camera.
     normal: Direction<Camera>,
     distance_mm: f64,
+    /// Which way the heads of its screws look, where they lean from it together.
+    heads: Option<Direction<Camera>>,
     camera: CameraModel,
 }
 
@@ -72,6 +74,7 @@ impl FaceFit {
         Some(Self {
             normal: Direction::from_vector(normal)?,
             distance_mm: -1e6 / normal.norm(),
+            heads: None,
             camera,
         })
     }
@@ -103,6 +106,7 @@ impl FaceFit {
             Some((normal, distance_mm)) => Some(Self {
                 normal,
                 distance_mm,
+                heads: None,
                 camera,
             }),
             None => Self::of(frame, working_depth_mm),
@@ -115,6 +119,7 @@ impl FaceFit {
         Some(Self {
             normal,
             distance_mm: plane.depth_mm * normal.vector().z,
+            heads: plane.heads_normal,
             camera,
         })
     }
@@ -124,10 +129,20 @@ impl FaceFit {
         self.normal
     }
 
-    /// How far heads lean from the face together: the middle one of them, if no more than one in five leans less than half as far to that side. One head's
-    /// top is measured to 3° (95 % within 11°), and the middle of a few such measurements is still off by 10° now and then.
+    /// Which way the heads of its screws look, where they lean from it together.
+    pub fn heads(&self) -> Option<Direction<Camera>> {
+        self.heads
+    }
+
+    /// The same plane, with heads that look that way.
+    pub fn with_heads(self, heads: Option<Direction<Camera>>) -> Self {
+        Self { heads, ..self }
+    }
+
+    /// Which way heads look together: as the middle one of them does, if no more than one in five leans from the face less than half as far to that
+    /// side. One head's top is measured to 3° (95 % within 11°), and the middle of a few such measurements is still off by 10° now and then.
     /// `None` with fewer than three.
-    pub fn lean_rad(&self, heads: impl Iterator<Item = Direction<Camera>>) -> Option<f64> {
+    pub fn look_together(&self, heads: impl Iterator<Item = Direction<Camera>>) -> Option<Direction<Camera>> {
         let heads: Vec<_> = heads.collect();
         if heads.len() < 3 {
             return None;
@@ -139,7 +154,7 @@ impl FaceFit {
         let toward = across(&middle);
         let apart = |n: &&Direction<Camera>| across(n).dot(&toward) < LEANS_TOO * toward.norm_squared();
         let together = heads.iter().filter(apart).count() <= heads.len() / MAY_LEAN_APART;
-        together.then(|| middle.angle_rad(face))
+        together.then_some(middle)
     }
 
     /// Depth of the plane at a pixel, mm.
@@ -154,7 +169,7 @@ impl FaceFit {
             depth_mm: self.distance_mm / self.normal.vector().z,
             tilt_rad: tilt_rad(self.normal),
             normal: Some(self.normal),
-            heads_lean_rad: None,
+            heads_normal: self.heads,
         }
     }
 }
@@ -391,13 +406,17 @@ mod tests {
         let fit = FaceFit {
             normal: straight,
             distance_mm: -1500.0,
+            heads: None,
             camera,
         };
         let head = |degrees: f64| {
             let (sin, cos) = degrees.to_radians().sin_cos();
             Direction::from_vector(Vector3::new(sin, 0.0, -cos)).expect("not zero")
         };
-        let lean = |degrees: &[f64]| fit.lean_rad(degrees.iter().map(|d| head(*d))).map(f64::to_degrees);
+        let lean = |degrees: &[f64]| {
+            let look = fit.look_together(degrees.iter().map(|d| head(*d)));
+            look.map(|look| look.angle_rad(straight).to_degrees())
+        };
         assert_eq!(lean(&[12.0, 12.0]), None);
         assert_eq!(lean(&[12.0, 13.0, 2.0]), None);
         assert!(lean(&[12.0, 13.0, 8.0]).is_some_and(|l| (l - 12.0).abs() < 1e-6));

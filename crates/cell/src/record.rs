@@ -59,6 +59,8 @@ pub enum LeftAlone {
     OtherDrive,
     /// A person should look.
     Review,
+    /// The bit has not met it where it is seen: only a person can say where it is.
+    NotMet,
     /// There was no depth at it.
     NoDepth,
     /// It lies at the border of every arm's calibrated volume.
@@ -80,6 +82,7 @@ impl fmt::Display for LeftAlone {
         f.write_str(match self {
             Self::OtherDrive => "the bit does not fit",
             Self::Review => "a person should look",
+            Self::NotMet => "the bit has not met it",
             Self::NoDepth => "no depth was measured",
             Self::HullEdge => "at the border of the calibrated volume",
             Self::HullOutside => "outside the calibrated volume",
@@ -106,9 +109,16 @@ pub struct FacePlane {
     /// Which way it looks, towards the camera; not in journals of versions before.
     #[serde(default)]
     pub normal: Option<Direction<Camera>>,
-    /// How far the heads of its screws lean from it together, rad; `None` with fewer than three, or where they do not lean together.
+    /// Which way the heads of its screws look together; `None` with fewer than three, or where they do not lean together.
     #[serde(default)]
-    pub heads_lean_rad: Option<f64>,
+    pub heads_normal: Option<Direction<Camera>>,
+}
+
+impl FacePlane {
+    /// How far the heads of its screws lean from it together, rad.
+    pub fn heads_lean_rad(&self) -> Option<f64> {
+        Some(self.heads_normal?.angle_rad(self.normal?))
+    }
 }
 
 /// One burst of the driver.
@@ -191,6 +201,8 @@ pub enum Purpose {
     Missed,
     /// To take out what a person has clicked on.
     Clicked,
+    /// To try what is left, however unlikely, before a cover that still does not come off is given up.
+    LastTry,
 }
 
 /// One look at a face and what followed.
@@ -224,6 +236,12 @@ impl FaceRecord {
     /// Screws of this look that are out.
     pub fn removed(&self) -> usize {
         self.attempts.iter().filter(|a| a.removed()).count()
+    }
+
+    /// Finds of this look that the bit did not meet.
+    pub fn not_met(&self) -> impl Iterator<Item = &Found> {
+        let not_met = self.attempts.iter().filter(|a| a.end() == Some(DriveEnd::MissedHead));
+        not_met.filter_map(|a| self.found.get(a.found))
     }
 }
 

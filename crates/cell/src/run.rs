@@ -18,8 +18,8 @@ use crate::packml::{Command, Illegal, Machine, State};
 use crate::plan::{self, Reach, SafeTarget, Target};
 use crate::program::{FaceId, Program, Step, Work};
 use crate::record::{
-    Act, CoverRecord, Event, ExclusionReason, FaceRecord, LeftAlone, NgReason, Outcome, PictureId, PullEnd, Purpose,
-    ScrewAttempt, SeenBy, UnitRecord, Verdict,
+    Act, CoverRecord, Event, ExclusionReason, FaceRecord, Found, LeftAlone, NgReason, Outcome, PictureId, PullEnd,
+    Purpose, ScrewAttempt, SeenBy, UnitRecord, Verdict,
 };
 use crate::removal::Mover;
 use calibration::Map;
@@ -733,8 +733,8 @@ impl Way<'_> {
     fn is_doubtful(&self, found: usize) -> bool {
         // a person's click leaves no doubt
         let face = self.record.faces.last().filter(|f| f.purpose != Purpose::Clicked);
-        let find = face.and_then(|f| f.found.get(found));
-        find.is_some_and(|find| plan::is_doubtful(find.score, self.face_odds()))
+        face.and_then(|f| Some((f.found.get(found)?, look::odds(&self.runner.config, f.purpose))))
+            .is_some_and(|(find, odds)| plan::is_doubtful(find.score, odds))
     }
 
     /// Lets the time pass that computing on a picture is budgeted with.
@@ -918,17 +918,14 @@ impl Way<'_> {
         Ok(Some(standing))
     }
 
-    /// Pulls a cover; if it stays, looks for missed screws on the faces that hold it, once, and pulls again.
+    /// Pulls a cover; if it stays, looks for missed screws on the faces that hold it, asks a person if one may be asked, tries what is left, and pulls
+    /// again whenever a screw has come out.
     async fn cover(&mut self, index: usize, step: &Step) -> Result<(), Stop> {
         let Work::Cover { cover, held_by, .. } = &step.work else {
             return Ok(());
         };
         if self.pull(index, step).await? == PullEnd::Off {
             return Ok(());
-        }
-        // A screw that is known to stand holds the cover: looking for others would not free it. One that the bit never met may be none.
-        if let Some(known) = self.known_standing(held_by, |end| end != Some(DriveEnd::MissedHead)) {
-            return Err(Stop::Decided(known));
         }
         self.observer.note(&format!(
             "the {cover} cover does not come off: looking for missed screws"
@@ -939,31 +936,32 @@ impl Way<'_> {
         let mut faces: Vec<(&FaceId, f64)> = held_by.iter().map(|face| (face, self.doubt(face))).collect();
         let stands_there = |face: &FaceId| *face == step.present;
         faces.sort_by(|a, b| (b.1.total_cmp(&a.1)).then(stands_there(b.0).cmp(&stands_there(a.0))));
-        for (face, _) in faces {
-            if !self.record.faces.iter().any(|f| f.face == *face) {
-                continue; // this product has no screws there, or the face cannot be presented yet
+        // a face without a record has no screws on this product, or cannot be presented yet
+        faces.retain(|(face, _)| self.record.faces.iter().any(|f| f.face == **face));
+        let asked = self.may_ask().then_some(Purpose::Clicked);
+        for purpose in [Some(Purpose::Missed), asked, Some(Purpose::LastTry)]
+            .into_iter()
+            .flatten()
+        {
+            // A screw that is known to stand holds the cover: looking for others would not free it. One that the bit has not met may be none, but is likelier
+            // one than what is left for a last try.
+            let last = purpose == Purpose::LastTry;
+            let counts = |end| last || end != Some(DriveEnd::MissedHead);
+            if let Some(known) = self.known_standing(held_by, counts) {
+                return Err(Stop::Decided(known));
             }
-            if self.screws(index, step, face, Purpose::Missed).await? > 0 {
-                pulled_again = true;
-                if self.pull(index, step).await? == PullEnd::Off {
-                    return Ok(self.log(Event::Recovery { on: false })?);
-                }
+            // the grip may have slipped: that is likelier than what is left, and a bounded pull may be tried a second time
+            if last && !pulled_again && self.pull(index, step).await? == PullEnd::Off {
+                return Ok(self.log(Event::Recovery { on: false })?);
             }
-        }
-        if self.may_ask() {
-            for face in held_by {
-                let looked_at = self.record.faces.iter().any(|f| f.face == *face);
-                if looked_at && self.screws(index, step, face, Purpose::Clicked).await? > 0 {
+            for (face, _) in &faces {
+                if self.screws(index, step, face, purpose).await? > 0 {
                     pulled_again = true;
                     if self.pull(index, step).await? == PullEnd::Off {
                         return Ok(self.log(Event::Recovery { on: false })?);
                     }
                 }
             }
-        }
-        // the grip may have slipped: a bounded pull may be tried a second time
-        if !pulled_again && self.pull(index, step).await? == PullEnd::Off {
-            return Ok(self.log(Event::Recovery { on: false })?);
         }
         Err(Stop::Decided(self.known_standing(held_by, |_| true).unwrap_or_else(
             || Outcome::Ng {
@@ -992,7 +990,7 @@ impl Way<'_> {
     ///
     /// # Arguments
     /// * `counts` – which ends of an attempt say that there is one.
-    fn known_standing(&self, faces: &[FaceId], counts: fn(Option<DriveEnd>) -> bool) -> Option<Outcome> {
+    fn known_standing(&self, faces: &[FaceId], counts: impl Fn(Option<DriveEnd>) -> bool) -> Option<Outcome> {
         for face in faces {
             let Some(last) = self.record.faces.iter().rev().find(|f| f.face == *face) else {
                 continue;
@@ -1021,6 +1019,13 @@ impl Way<'_> {
                 return Some(Outcome::Ng {
                     reason,
                     detail: format!("{face}: a screw {what} in {bursts} burst(s), its cover stays"),
+                });
+            }
+            let not_met = |f: &Found| f.left_alone == Some(LeftAlone::NotMet);
+            if counts(Some(DriveEnd::MissedHead)) && last.found.iter().any(not_met) {
+                return Some(Outcome::Ng {
+                    reason: NgReason::ScrewMissed,
+                    detail: format!("{face}: a screw was not met by the bit, its cover stays"),
                 });
             }
             let barred = [

@@ -65,7 +65,7 @@ fn a_worn_recess_is_pressed_harder_and_then_met_with_another_bit() {
 
 #[test]
 fn nothing_is_milled_unless_everything_allows_it() {
-    let seized = [DriveEnd::Seized; 3];
+    let seized = [DriveEnd::Seized; 5];
     let on = |face: &'static str, permitted: bool, change: fn(&mut CellConfig)| {
         let fake = Fake::new(&[
             ("front", vec![screw(90.0, 0.0)]),
@@ -134,6 +134,75 @@ fn a_person_clicks_on_what_the_detector_does_not_see() {
     assert_eq!((helped.assist, fake.standing()), (Assist::Remote, 0));
     assert!(helped.faces.iter().any(|f| f.purpose == Purpose::Clicked));
     assert!(helped.times.waiting_s > 0.0 || helped.looks.len() > 1);
+}
+
+/// Finds the heads of the front where they are not.
+struct Aside(Fake, f64);
+
+impl cell::run::Finder for Aside {
+    fn find(&self, frame: &geometry::RgbdFrame, odds: f64) -> Result<Vec<vision::Screw>, cell::device::DeviceError> {
+        let mut found = self.0.find(frame, odds)?;
+        let on_front = self.0.world().presented == "front";
+        for screw in found.iter_mut().filter(|_| on_front) {
+            screw.pixel.u_px += self.1;
+            let aside_mm = self.1 * frame.camera.map_or(1.0, |camera| camera.pixel_mm(1500.0));
+            screw.camera = screw
+                .camera
+                .map(|p| geometry::Point::new(p.x_mm() + aside_mm, p.y_mm(), p.z_mm()));
+        }
+        Ok(found)
+    }
+    fn model(&self) -> String {
+        "aside".into()
+    }
+}
+
+#[test]
+fn a_person_shows_where_a_screw_is_that_the_bit_does_not_meet() {
+    let unmet = || Fake::new(&[("front", vec![screw(60.0, 40.0)])]);
+    let run = |fake: &Fake, click: bool| {
+        let folder = tempfile::tempdir().expect("folder");
+        let mut config = fake::config();
+        config.help.click = click;
+        let mut runner = Runner::new(
+            fake.devices(),
+            Arc::new(Aside(fake.clone(), 2.2)),
+            vec![map()],
+            Program::paper().expect("built-in program"),
+            config,
+            Journal::open(folder.path()).expect("journal"),
+        )
+        .expect("runner");
+        runner.start().expect("started");
+        block_on(runner.run_unit(&Silent)).expect("a record")
+    };
+    let alone = run(&unmet(), false);
+    assert!(
+        matches!(
+            &alone.outcome,
+            Some(Outcome::Ng {
+                reason: NgReason::ScrewMissed,
+                ..
+            })
+        ),
+        "{:?}",
+        alone.outcome
+    );
+    let again = alone
+        .faces
+        .iter()
+        .filter(|f| f.purpose != Purpose::Work && f.face.0 == "front");
+    assert_eq!(
+        again.map(|f| f.attempts.len()).sum::<usize>(),
+        0,
+        "not driven at in the same place"
+    );
+
+    let fake = unmet();
+    fake.world().clicks.insert("front".into(), vec![[60.0, 40.0]]);
+    let helped = run(&fake, true);
+    assert_eq!((helped.outcome, fake.standing()), (Some(Outcome::Ok), 0));
+    assert_eq!(helped.assist, Assist::Remote);
 }
 
 #[test]

@@ -63,7 +63,8 @@ fn main() -> Result<(), ModelError> {
                 .iter()
                 .filter(|s| s.verdict == Verdict::Screw)
                 .filter_map(|s| s.top_normal);
-            let lean_deg = fit.lean_rad(heads).map(f64::to_degrees);
+            let together = fit.look_together(heads);
+            let lean_deg = together.map(|look| look.angle_rad(fit.normal()).to_degrees());
             let (count, measured) = match is_bent {
                 true => (&mut bent, &mut bent_deg),
                 false => (&mut straight, &mut straight_deg),

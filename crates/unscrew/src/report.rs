@@ -326,6 +326,7 @@ fn figure(
             Purpose::Work => escape(&face.step_name),
             Purpose::Missed => "looked again for missed screws".into(),
             Purpose::Clicked => "looked again with a person's clicks".into(),
+            Purpose::LastTry => "looked again for whatever may still be a screw".into(),
         },
         face.removed(),
         if retries > 0 {

@@ -69,11 +69,14 @@ impl Way<'_> {
         attempts.filter(|a| a.found == found).map(|a| a.bursts.len()).sum()
     }
 
-    /// True if a find of the face that is being worked on is a screw with enough probability, or a person's word.
+    /// True if a find of the face that is being worked on is a screw with enough probability by its picture alone, or a person's word.
     fn is_worth_a_search(&self, found: usize) -> bool {
         let find = |face: &FaceRecord| face.found.get(found).map_or(0.0, |find| find.score);
-        let face = self.record.faces.last();
-        face.is_some_and(|face| face.purpose == Purpose::Clicked || find(face) >= WORTH_A_SEARCH)
+        self.record.faces.last().is_some_and(|face| match face.purpose {
+            Purpose::Clicked => true,
+            Purpose::Survey | Purpose::Work => find(face) >= WORTH_A_SEARCH,
+            Purpose::Missed | Purpose::LastTry => false,
+        })
     }
 
     /// Drives at places on a ring, until the bit meets something.

@@ -553,9 +553,13 @@ impl DriverTool for Fake {
             let lie = world.lie_at_burst == Some(n);
             let face = world.presented.clone();
             let heads = world.faces.get_mut(&face).expect("a face");
-            let met = heads
-                .iter_mut()
-                .find(|h| h.stands && on_face(h.at_mm, tilt).distance_mm(tip) < 0.75);
+            // the spring takes 3 mm along the axis
+            let meets = |h: &Head| {
+                let off = tip.vector() - on_face(h.at_mm, tilt).vector();
+                let along = normal(tilt) * off.dot(&normal(tilt));
+                along.norm() < 3.0 && (off - along).norm() < 0.75
+            };
+            let met = heads.iter_mut().find(|h| h.stands && meets(h));
             let end = match met {
                 None => DriveEnd::MissedHead,
                 Some(head) => {
