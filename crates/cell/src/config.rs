@@ -149,9 +149,9 @@ pub struct Exclusion {
     pub face_tilt_max_rad: f64,
     /// Largest lean of a face's screws together against the face, rad: so far the bit follows them.
     pub heads_lean_max_rad: f64,
-    /// Largest tilt of the sheet around a screw against the camera's axis, rad: so far the bit follows it.
+    /// Largest lean of the sheet around a screw and of its head from the way in which the bit comes, rad.
     pub screw_tilt_max_rad: f64,
-    /// Screws of a face that may sit on sheet bent beyond that before it is excluded.
+    /// Screws of a face that may lean beyond that before it is excluded.
     pub bent_max: usize,
 }
 
@@ -162,7 +162,7 @@ impl Default for Exclusion {
             review_score_min: 0.3,
             face_tilt_max_rad: 8f64.to_radians(),
             heads_lean_max_rad: 20f64.to_radians(),
-            screw_tilt_max_rad: 20f64.to_radians(),
+            screw_tilt_max_rad: 11f64.to_radians(),
             bent_max: 0,
         }
     }

@@ -19,10 +19,12 @@ const COVER_OFF_MM: f64 = 15.0;
 const SAME_HEAD: f64 = 0.6;
 /// Width that is taken for a head that only a person has seen, mm.
 const USUAL_HEAD_MM: f64 = 9.5;
-/// Height of its recess's rim above the sheet, mm.
-const USUAL_RIM_MM: f64 = 2.5;
 /// The same in a picture, px.
 const USUAL_HEAD_PX: f64 = 30.0;
+/// Height of its recess's rim above the sheet, mm.
+const USUAL_RIM_MM: f64 = 2.5;
+/// In a last try a head is searched around if it is a screw with so much probability, the odds of that included: two in a hundred by its picture.
+pub(crate) const LIKELY_ENOUGH: f64 = 0.995;
 /// Standard error of a click, px.
 const CLICK_PX: f64 = 1.5;
 
@@ -149,26 +151,32 @@ impl Judge<'_> {
         let odds = self.odds(purpose);
         let looks = || so_far.faces.iter().filter(|f| f.face == *face);
         let at = |f: &Found| shot.to_shot(Pixel::new(f.u_px, f.v_px));
-        let not_met: Vec<Pixel> = looks().flat_map(FaceRecord::not_met).map(at).collect();
-        let is_not_met = |s: &vision::Screw| {
-            not_met
-                .iter()
-                .any(|p| p.distance_px(&s.pixel) < SAME_HEAD * s.diameter_px)
+        // a face that is worked on anew was left in the middle of it
+        let is_anew = matches!(purpose, Purpose::Survey | Purpose::Work);
+        let not_met = looks().filter(|_| !is_anew).flat_map(FaceRecord::not_met);
+        let not_met: Vec<(Pixel, bool)> = not_met.map(|(f, tried)| (at(f), tried.searched())).collect();
+        let not_met_by = |s: &vision::Screw, enough: fn(bool) -> bool| {
+            let there = |p: &Pixel| p.distance_px(&s.pixel) < SAME_HEAD * s.diameter_px;
+            not_met.iter().any(|(p, searched)| there(p) && enough(*searched))
         };
+        let is_not_met = |s: &vision::Screw| not_met_by(s, |_| true);
         let mut screws = self.finder.find(&shot.frame, odds)?;
-        // what the bit did not meet is not driven at again in the same place
-        for screw in screws
-            .iter_mut()
-            .filter(|s| s.verdict == Verdict::Screw && is_not_met(s))
-        {
-            screw.verdict = Verdict::Review;
+        // What the bit did not meet is not driven at again in the same place; in a last try, what is likely enough is searched around.
+        let is_searched_around = |s: &vision::Screw| {
+            purpose == Purpose::LastTry && s.fits >= LIKELY_ENOUGH && !not_met_by(s, |searched| searched)
+        };
+        for screw in screws.iter_mut().filter(|s| s.verdict == Verdict::Screw) {
+            if is_not_met(screw) && !is_searched_around(screw) {
+                screw.verdict = Verdict::Review;
+            }
         }
         let mut screws = clicked_on(shot, screws, clicks.unwrap_or_default(), is_not_met);
         let certain = screws
             .iter()
             .filter(|s| !plan::is_doubtful(s.fits, odds) || s.verdict == Verdict::Other);
         let certain = certain.map(|s| (s.pixel, s.diameter_px));
-        let before = looks().last().map_or(&[][..], |f| &f.found);
+        let before = looks().rfind(|f| self.odds(f.purpose) == 1.0);
+        let before = before.map_or(&[][..], |f| &f.found);
         // what is left of a face that has been worked on are its holes: the sheet around them is the face
         let holes = looks()
             .flat_map(|f| &f.found)
@@ -193,13 +201,15 @@ impl Judge<'_> {
             fit.as_ref(),
             &shot.frame,
         );
-        // where most screws are out already, they have told which way those that are left look
-        let told = || looks().filter_map(|f| f.plane?.heads_normal).last();
         let tops = screws
             .iter()
             .filter(|s| s.verdict == Verdict::Screw && !plan::is_doubtful(s.fits, odds));
-        let tops = tops.filter_map(|s| s.top_normal);
-        let fit = fit.map(|fit| fit.with_heads(fit.look_together(tops).or_else(told)));
+        let tops: Vec<_> = tops.filter_map(|s| s.top_normal).collect();
+        let fit = fit.map(|fit| match tops.len() {
+            // most screws are out already: they have told which way those that are left look
+            0..=2 => fit.with_heads(looks().rev().find_map(|f| f.plane?.heads_normal)),
+            _ => fit.with_heads(fit.look_together(tops.into_iter())),
+        });
         let (mut found, targets) = plan::plan(&screws, shot, fit.as_ref(), &self.reaches, config);
         let seen_but_not_met =
             |s: &vision::Screw| s.verdict == Verdict::Review && !plan::is_doubtful(s.fits, odds) && is_not_met(s);
@@ -414,8 +424,11 @@ mod tests {
     use crate::program::Program;
     use geometry::{DepthMap, RgbImage};
 
-    /// One head in doubt in the corner of a frame of flanges.
-    struct InDoubt;
+    /// One head in doubt, so far away.
+    struct InDoubt(Pixel, f64);
+
+    /// In the corner of a frame of flanges.
+    const IN_THE_CORNER: InDoubt = InDoubt(AT, 1500.0);
 
     const AT: Pixel = Pixel::new(640.0, 100.0);
 
@@ -424,7 +437,7 @@ mod tests {
             let alone = 0.1;
             let fits = odds * alone / (odds * alone + 1.0 - alone);
             Ok(vec![vision::Screw {
-                pixel: AT,
+                pixel: self.0,
                 sigma_px: 0.3,
                 diameter_px: 20.0,
                 score: fits,
@@ -433,7 +446,7 @@ mod tests {
                 verdict: if fits > 0.6 { Verdict::Screw } else { Verdict::Review },
                 cues: Vec::new(),
                 angle_rad: None,
-                camera: frame.camera.map(|camera| camera.unproject(AT, 1500.0)),
+                camera: frame.camera.map(|camera| camera.unproject(self.0, self.1)),
                 normal: None,
                 top_normal: None,
                 sigma_lateral_mm: Some(0.1),
@@ -477,29 +490,9 @@ mod tests {
         }
     }
 
-    #[test]
-    fn a_face_whose_screws_are_out_is_known_by_its_holes() {
-        let (config, program) = (CellConfig::simulated(), Program::paper().expect("embedded"));
-        let judge = Judge {
-            finder: &InDoubt,
-            reaches: Vec::new(),
-            config: &config,
-        };
-        let (shot, face) = (shot(), FaceId("front_inner".into()));
-        let verdict = |so_far: &UnitRecord| {
-            let question = Question {
-                index: 5,
-                step: &program.steps[5],
-                face: &face,
-                purpose: Purpose::Missed,
-                so_far,
-                clicks: None,
-            };
-            judge.face(&shot, &question).expect("judged").face.found[0].verdict
-        };
+    /// What is known of a face that has been worked on: the holes of its flanges.
+    fn worked_on(face: &FaceId) -> UnitRecord {
         let mut record = UnitRecord::new(1, 0.0);
-        // what is behind the flanges is most of what is seen
-        assert_eq!(verdict(&record), Verdict::Review, "the scene should mislead");
         let hole = |u_px: f64, v_px: f64| Found {
             u_px,
             v_px,
@@ -532,6 +525,84 @@ mod tests {
                 .to_vec(),
             attempts: Vec::new(),
         });
-        assert_eq!(verdict(&record), Verdict::Screw);
+        record
+    }
+
+    #[test]
+    fn a_face_whose_screws_are_out_is_known_by_its_holes() {
+        let (config, program) = (CellConfig::simulated(), Program::paper().expect("embedded"));
+        let judge = Judge {
+            finder: &IN_THE_CORNER,
+            reaches: Vec::new(),
+            config: &config,
+        };
+        let (shot, face) = (shot(), FaceId("front_inner".into()));
+        let verdict = |so_far: &UnitRecord| {
+            let question = Question {
+                index: 5,
+                step: &program.steps[5],
+                face: &face,
+                purpose: Purpose::Missed,
+                so_far,
+                clicks: None,
+            };
+            judge.face(&shot, &question).expect("judged").face.found[0].verdict
+        };
+        // what is behind the flanges is most of what is seen
+        assert_eq!(
+            verdict(&UnitRecord::new(1, 0.0)),
+            Verdict::Review,
+            "the scene should mislead"
+        );
+        assert_eq!(verdict(&worked_on(&face)), Verdict::Screw);
+    }
+
+    #[test]
+    fn a_doubtful_head_behind_the_face_is_tried_if_its_plate_looks_the_same_way() {
+        let (config, program) = (CellConfig::simulated(), Program::paper().expect("embedded"));
+        let face = FaceId("front_inner".into());
+        let finder = InDoubt(Pixel::new(400.0, 310.0), 1560.0);
+        let record = worked_on(&face);
+        let verdict = |slope_mm: f32| {
+            let mut shot = shot();
+            let depth = shot.frame.depth.as_mut().expect("depth");
+            for j in 120..190 {
+                for i in 160..240 {
+                    depth.depth_mm[(j * 400 + i) as usize] = 1560.0 + slope_mm * (i - 200) as f32;
+                }
+            }
+            let judge = Judge {
+                finder: &finder,
+                reaches: Vec::new(),
+                config: &config,
+            };
+            let question = Question {
+                index: 5,
+                step: &program.steps[5],
+                face: &face,
+                purpose: Purpose::Missed,
+                so_far: &record,
+                clicks: None,
+            };
+            judge.face(&shot, &question).expect("judged").face.found[0].verdict
+        };
+        assert_eq!(verdict(0.0), Verdict::Screw, "a plate behind the flanges");
+        assert_eq!(verdict(2.0), Verdict::Review, "a gap of a grille");
+    }
+
+    #[test]
+    fn a_person_says_that_it_is_a_screw_and_where_the_bit_has_not_met_it_also_where() {
+        let shot = shot();
+        let found = IN_THE_CORNER.find(&shot.frame, 1.0).expect("found");
+        let click = [AT.u_px + 5.0, AT.v_px - 4.0];
+        let after = |not_met: bool| clicked_on(&shot, found.clone(), &[click], |_| not_met).remove(0);
+        let (known, shown) = (after(false), after(true));
+        assert_eq!((known.verdict, known.pixel), (Verdict::Screw, AT));
+        assert_eq!(
+            (shown.verdict, shown.pixel),
+            (Verdict::Screw, Pixel::new(click[0], click[1]))
+        );
+        let depth_mm = shown.camera.expect("a place").z_mm();
+        assert!((depth_mm - (1500.0 - USUAL_RIM_MM)).abs() < 0.1, "{depth_mm}");
     }
 }

@@ -397,11 +397,11 @@ fn judge(
         sigma_lateral_mm: mapped.map(|m| m.sigma_lateral_mm.hypot(screw.sigma_lateral_mm.unwrap_or(0.0))),
         sigma_depth_mm: mapped.map(|m| m.sigma_depth_mm.hypot(screw.sigma_depth_mm.unwrap_or(0.0))),
         hull: mapped.map(|m| m.hull),
-        tilt_rad: leaning(sheet, head_normal(screw)),
+        tilt_rad: leaning(sheet, head_normal(screw), -Vector3::z()),
         left_alone: None,
         refusal: None,
     };
-    match target(screw, &found, shot, sheet, face, arms, config) {
+    match target(screw, shot, sheet, face, arms, config) {
         Ok(choices) => (found, choices),
         Err(refused) => {
             found.left_alone = Some(refused.why);
@@ -414,7 +414,6 @@ fn judge(
 /// Every arm that can go to a screw, in the order of the arms.
 fn target(
     screw: &vision::Screw,
-    found: &Found,
     shot: &Shot,
     sheet: Option<Direction<Camera>>,
     face: Option<&FaceFit>,
@@ -430,13 +429,11 @@ fn target(
     if !is_head_size(screw.diameter_px, point, shot, config) {
         return Err(LeftAlone::HeadSize.into());
     }
-    if found
-        .tilt_rad
-        .is_some_and(|tilt| tilt > config.exclusion.screw_tilt_max_rad)
-    {
+    let normal = line_of_approach(sheet, screw.top_normal, face, config).ok_or(LeftAlone::NoDepth)?;
+    let askew = leaning(sheet, head_normal(screw), normal.vector());
+    if askew.is_some_and(|lean| lean > config.exclusion.screw_tilt_max_rad) {
         return Err(LeftAlone::Bent.into());
     }
-    let normal = line_of_approach(sheet, screw.top_normal, face, config).ok_or(LeftAlone::NoDepth)?;
     let mut refused = Refused::from(LeftAlone::HullOutside);
     let mut choices = Vec::new();
     for reach in arms {
@@ -462,16 +459,17 @@ fn head_normal(screw: &vision::Screw) -> Option<Direction<Camera>> {
     screw.top_normal.or(screw.normal)
 }
 
-/// How far the sheet leans. Two independent measurements, the sheet around the head and the top of the head, have to say so, and both to
+/// How far the sheet leans from a line. Two independent measurements, the sheet around the head and the top of the head, have to say so, and both to
 /// the same side: an edge nearby spoils the one, a head seated askew the other.
-fn leaning(sheet: Option<Direction<Camera>>, head: Option<Direction<Camera>>) -> Option<f64> {
+fn leaning(sheet: Option<Direction<Camera>>, head: Option<Direction<Camera>>, line: Vector3<f64>) -> Option<f64> {
+    let off = |normal: Direction<Camera>| normal.vector().angle(&line);
     match (sheet, head) {
         (Some(sheet), Some(head)) => {
-            let across = |n: Direction<Camera>| n.vector().xy();
+            let across = |n: Direction<Camera>| n.vector() - line * n.vector().dot(&line);
             let same_side = across(sheet).dot(&across(head)) / (across(sheet).norm() * across(head).norm()).max(1e-12);
-            Some(tilt_rad(sheet).min(tilt_rad(head)) * same_side.max(0.0))
+            Some(off(sheet).min(off(head)) * same_side.max(0.0))
         }
-        (one, other) => one.or(other).map(tilt_rad),
+        (one, other) => one.or(other).map(off),
     }
 }
 
@@ -492,7 +490,8 @@ fn line_of_approach(
     };
     let face = fit.normal();
     let leans = |normal: Direction<Camera>| normal.angle_rad(face) > config.approach.local_normal_from_rad;
-    if let Some(heads) = fit.heads().filter(|heads| leans(*heads)) {
+    let in_range = |heads: &Direction<Camera>| heads.angle_rad(face) <= config.exclusion.heads_lean_max_rad;
+    if let Some(heads) = fit.heads().filter(|heads| leans(*heads) && in_range(heads)) {
         return Some(heads);
     }
     match (sheet, head) {
@@ -514,7 +513,7 @@ pub fn exclusion(face: &FaceRecord, least_screws: usize, config: &CellConfig) ->
             format!("{name}: the face leans by {tilt:.1}°, more than {most:.1}°"),
         ));
     }
-    let leaning = face.plane.and_then(|plane| plane.heads_lean_rad());
+    let leaning = face.plane.and_then(|plane| plane.heads_lean_rad);
     if let Some(lean) = leaning.filter(|lean| *lean > rules.heads_lean_max_rad) {
         let (lean, most) = (lean.to_degrees(), rules.heads_lean_max_rad.to_degrees());
         return Some((
@@ -527,7 +526,7 @@ pub fn exclusion(face: &FaceRecord, least_screws: usize, config: &CellConfig) ->
     if bent > rules.bent_max {
         return Some((
             ExclusionReason::CoverBent,
-            format!("{name}: the sheet around {bent} screw(s) is bent beyond range"),
+            format!("{name}: {bent} screw(s) lean beyond range"),
         ));
     }
     let sure_enough = |f: &&Found| f.verdict == Verdict::Review && f.score >= rules.review_score_min;
@@ -566,12 +565,12 @@ mod tests {
             let (v, u) = turned.to_radians().sin_cos();
             Direction::new(sin * u, sin * v, -cos)
         };
-        let lean = |sheet, head| leaning(sheet, head).expect("measured").to_degrees();
+        let lean = |sheet, head| leaning(sheet, head, -Vector3::z()).expect("measured").to_degrees();
         assert!((lean(towards(14.0, 30.0), towards(12.0, 40.0)) - 12.0).abs() < 0.3);
         assert!(lean(towards(16.0, 30.0), towards(16.0, 125.0)) < 0.1);
         assert!(lean(towards(16.0, 30.0), towards(2.0, 30.0)) < 2.1);
         assert!((lean(towards(13.0, 0.0), None) - 13.0).abs() < 1e-6);
-        assert_eq!(leaning(None, None), None);
+        assert_eq!(leaning(None, None, -Vector3::z()), None);
     }
 
     #[test]
@@ -585,6 +584,7 @@ mod tests {
             depth_mm: 1500.0,
             tilt_rad: 0.0,
             normal: towards(0.0),
+            heads_lean_rad: None,
             heads_normal: None,
         };
         let face = FaceFit::known(&plane, camera).expect("known");
@@ -611,6 +611,7 @@ mod tests {
                 depth_mm: 1500.0,
                 tilt_rad: 0.0,
                 normal: towards(0.0),
+                heads_lean_rad: None,
                 heads_normal: towards(heads),
             };
             let face = FaceFit::known(&plane, camera).expect("known");

@@ -169,6 +169,7 @@ impl FaceFit {
             depth_mm: self.distance_mm / self.normal.vector().z,
             tilt_rad: tilt_rad(self.normal),
             normal: Some(self.normal),
+            heads_lean_rad: self.heads.map(|heads| heads.angle_rad(self.normal)),
             heads_normal: self.heads,
         }
     }

@@ -109,16 +109,12 @@ pub struct FacePlane {
     /// Which way it looks, towards the camera; not in journals of versions before.
     #[serde(default)]
     pub normal: Option<Direction<Camera>>,
-    /// Which way the heads of its screws look together; `None` with fewer than three, or where they do not lean together.
+    /// How far the heads of its screws lean from it together, rad; `None` with fewer than three, or where they do not lean together.
+    #[serde(default)]
+    pub heads_lean_rad: Option<f64>,
+    /// Which way they look then; not in journals of versions before.
     #[serde(default)]
     pub heads_normal: Option<Direction<Camera>>,
-}
-
-impl FacePlane {
-    /// How far the heads of its screws lean from it together, rad.
-    pub fn heads_lean_rad(&self) -> Option<f64> {
-        Some(self.heads_normal?.angle_rad(self.normal?))
-    }
 }
 
 /// One burst of the driver.
@@ -177,6 +173,16 @@ impl ScrewAttempt {
     /// True if a second picture showed no screw where the bit had met nothing: there was none.
     pub fn absent(&self) -> bool {
         self.end() == Some(DriveEnd::MissedHead) && self.still_there == Some(false) && !self.removed()
+    }
+    /// True if the bit has met a recess: there is a screw, whatever the picture says.
+    pub fn met(&self) -> bool {
+        self.bursts
+            .iter()
+            .any(|b| b.end.is_some_and(|end| end != DriveEnd::MissedHead))
+    }
+    /// True if places around it were tried too.
+    pub fn searched(&self) -> bool {
+        self.retries() > 2
     }
     /// True if its head was milled.
     pub fn milled(&self) -> bool {
@@ -238,10 +244,10 @@ impl FaceRecord {
         self.attempts.iter().filter(|a| a.removed()).count()
     }
 
-    /// Finds of this look that the bit did not meet.
-    pub fn not_met(&self) -> impl Iterator<Item = &Found> {
-        let not_met = self.attempts.iter().filter(|a| a.end() == Some(DriveEnd::MissedHead));
-        not_met.filter_map(|a| self.found.get(a.found))
+    /// Finds of this look that the bit never met, with what was tried at them.
+    pub fn not_met(&self) -> impl Iterator<Item = (&Found, &ScrewAttempt)> {
+        let not_met = self.attempts.iter().filter(|a| !a.met() && !a.bursts.is_empty());
+        not_met.filter_map(|a| Some((self.found.get(a.found)?, a)))
     }
 }
 

@@ -24,6 +24,7 @@ use crate::record::{
 use crate::removal::Mover;
 use calibration::Map;
 use geometry::{Pixel, RgbdFrame};
+use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
@@ -729,8 +730,12 @@ impl Way<'_> {
         purpose.map_or(1.0, |purpose| look::odds_again(&self.runner.config, purpose))
     }
 
-    /// True if a find of the face that is being worked on is a target only because its cover did not come off.
+    /// True if a find of the face that is being worked on is a target only because its cover did not come off, and no bit has met it yet.
     fn is_doubtful(&self, found: usize) -> bool {
+        let mut attempts = self.record.faces.last().into_iter().flat_map(|f| &f.attempts);
+        if attempts.any(|a| a.found == found && a.met()) {
+            return false;
+        }
         // a person's click leaves no doubt
         let face = self.record.faces.last().filter(|f| f.purpose != Purpose::Clicked);
         face.and_then(|f| Some((f.found.get(found)?, look::odds(&self.runner.config, f.purpose))))
@@ -938,27 +943,31 @@ impl Way<'_> {
         faces.sort_by(|a, b| (b.1.total_cmp(&a.1)).then(stands_there(b.0).cmp(&stands_there(a.0))));
         // a face without a record has no screws on this product, or cannot be presented yet
         faces.retain(|(face, _)| self.record.faces.iter().any(|f| f.face == **face));
+        // A screw that is known to stand holds the cover: looking for others would not free it. One that the bit has not met may be none, but is likelier
+        // one than what is left for a last try.
         let asked = self.may_ask().then_some(Purpose::Clicked);
         for purpose in [Some(Purpose::Missed), asked, Some(Purpose::LastTry)]
             .into_iter()
             .flatten()
         {
-            // A screw that is known to stand holds the cover: looking for others would not free it. One that the bit has not met may be none, but is likelier
-            // one than what is left for a last try.
             let last = purpose == Purpose::LastTry;
-            let counts = |end| last || end != Some(DriveEnd::MissedHead);
-            if let Some(known) = self.known_standing(held_by, counts) {
-                return Err(Stop::Decided(known));
-            }
             // the grip may have slipped: that is likelier than what is left, and a bounded pull may be tried a second time
             if last && !pulled_again && self.pull(index, step).await? == PullEnd::Off {
                 return Ok(self.log(Event::Recovery { on: false })?);
             }
-            for (face, _) in &faces {
+            let mut left = faces.iter().map(|(face, _)| *face).collect::<VecDeque<_>>();
+            while let Some(face) = left.pop_front() {
+                if let Some(known) = self.known_standing(held_by, |end| last || end != Some(DriveEnd::MissedHead)) {
+                    return Err(Stop::Decided(known));
+                }
                 if self.screws(index, step, face, purpose).await? > 0 {
                     pulled_again = true;
                     if self.pull(index, step).await? == PullEnd::Off {
                         return Ok(self.log(Event::Recovery { on: false })?);
+                    }
+                    // one that nobody saw is seldom alone
+                    if last {
+                        left.push_front(face);
                     }
                 }
             }
@@ -1002,7 +1011,7 @@ impl Way<'_> {
                     .found
                     .get(a.found)
                     .is_some_and(|f| plan::is_doubtful(f.score, odds));
-                doubtful && a.end() == Some(DriveEnd::MissedHead)
+                doubtful && !a.met()
             };
             let failed = last
                 .attempts
@@ -1039,7 +1048,7 @@ impl Way<'_> {
             let screw = last
                 .found
                 .iter()
-                .find(|f| f.verdict == Verdict::Screw && f.left_alone.is_some_and(|why| barred.contains(&why)));
+                .find(|f| !plan::is_doubtful(f.score, odds) && f.left_alone.is_some_and(|why| barred.contains(&why)));
             if let Some((screw, why)) = screw.and_then(|f| Some((f, f.left_alone?))) {
                 let why = screw.refusal.clone().unwrap_or_else(|| why.to_string());
                 return Some(Outcome::Ng {

@@ -210,17 +210,16 @@ fn screws_of_a_bent_cover_are_driven_at_along_their_own_axes() {
     fake.world().lean_rad.insert("front".into(), 13f64.to_radians());
     let record = run(&fake);
     assert_eq!((record.outcome, fake.standing()), (Some(Outcome::Ok), 0));
-    let into_the_face = Vector3::x();
+    // the face's normal leans to the camera's right, the base's -y: the bit comes from there
+    let lean = 13f64.to_radians();
+    let along = Vector3::new(lean.cos(), lean.sin(), 0.0);
     let poses = fake.world().poses.clone();
     let leans = poses.iter().map(|pose| {
         let bit = pose.isometry().rotation * Vector3::z();
-        bit.angle(&into_the_face).to_degrees()
+        bit.angle(&along).to_degrees()
     });
     let leans: Vec<f64> = leans.collect();
-    assert!(
-        leans.len() >= 3 && leans.iter().all(|lean| (lean - 13.0).abs() < 0.5),
-        "{leans:?}"
-    );
+    assert!(leans.len() >= 3 && leans.iter().all(|off| *off < 0.5), "{leans:?}");
 }
 
 /// A pole of the cell that stands right before the first of two screws of the front.
@@ -521,7 +520,7 @@ fn on_a_stuck_cover_only_the_likeliest_doubtful_heads_are_tried() {
 
 #[test]
 fn before_a_stuck_cover_is_given_up_even_unlikely_heads_are_tried_once() {
-    // the top's screw is buried: the picture gives it one in a thousand, and a mark beside it one in ten
+    // the top's screw is buried: the picture gives it one in a thousand, and a mark beside it fifteen
     let buried = |fake: &Fake, odds: f64, found: &mut Vec<vision::Screw>| {
         if fake.world().presented != "top" {
             return;
@@ -535,12 +534,12 @@ fn before_a_stuck_cover_is_given_up_even_unlikely_heads_are_tried_once() {
             mark = Some(vision::Screw {
                 pixel: geometry::Pixel::new(screw.pixel.u_px, screw.pixel.v_px + 30.0),
                 camera: screw.camera.map(aside),
-                fits: with(0.1),
+                fits: with(0.015),
                 ..screw.clone()
             });
         }
         found.extend(mark);
-        for screw in found.iter_mut().filter(|s| s.fits < 0.9) {
+        for screw in found.iter_mut().filter(|s| s.fits < 0.6) {
             (screw.score, screw.verdict) = (screw.fits, vision::Verdict::Other);
         }
         found.iter_mut().for_each(|s| s.score = s.fits);
@@ -565,6 +564,58 @@ fn before_a_stuck_cover_is_given_up_even_unlikely_heads_are_tried_once() {
     // the grip might have slipped: pulled at again before the last try
     let pulls = fake.entries(&["PULL_TOP", "PULL_FRONT"]);
     assert_eq!(pulls, ["PULL_TOP", "PULL_TOP", "PULL_TOP", "PULL_FRONT"]);
+}
+
+#[test]
+fn in_a_last_try_a_likely_head_that_was_not_met_is_searched_around() {
+    // half behind a cable, the top's screw is in doubt and found 1.6 mm aside
+    let hidden = |fake: &Fake, odds: f64, found: &mut Vec<vision::Screw>| {
+        let on_top = fake.world().presented == "top";
+        for screw in found
+            .iter_mut()
+            .filter(|s| on_top && s.camera.is_none_or(|p| p.x_mm() > 60.0))
+        {
+            screw.fits = odds * 0.1 / (odds * 0.1 + 0.9);
+            screw.score = screw.fits;
+            screw.camera = screw
+                .camera
+                .map(|p| geometry::Point::new(p.x_mm() + 1.6, p.y_mm(), p.z_mm()));
+            if screw.fits < 0.6 {
+                screw.verdict = vision::Verdict::Review;
+            }
+        }
+    };
+    let fake = Fake::new(&[
+        ("front", vec![screw(0.0, 0.0)]),
+        ("top", vec![screw(0.0, 0.0), screw(90.0, 0.0)]),
+    ]);
+    let folder = tempfile::tempdir().expect("folder");
+    let program = Program::paper().expect("built-in program");
+    let mut runner = runner_with(&fake, folder.path(), program, Altered(fake.clone(), hidden));
+    let record = block_on(runner.run_unit(&Silent)).expect("a record");
+    assert_eq!((record.outcome, fake.standing()), (Some(Outcome::Ok), 0));
+    let tries = |purpose: Purpose| {
+        let looks = record.faces.iter().filter(move |f| f.purpose == purpose);
+        looks
+            .flat_map(|f| f.attempts.iter().map(|a| a.bursts.len()))
+            .collect::<Vec<_>>()
+    };
+    assert_eq!(tries(Purpose::Missed), [1]);
+    assert!(matches!(tries(Purpose::LastTry)[..], [tries] if tries > 2));
+}
+
+#[test]
+fn after_a_crash_a_head_that_was_not_met_has_its_ladder_still() {
+    let fake = Fake::new(&[(
+        "front",
+        vec![screw_that_ends(0.0, 0.0, &[DriveEnd::MissedHead]), screw(90.0, 0.0)],
+    )]);
+    let folder = tempfile::tempdir().expect("folder");
+    fake.world().die_at = Some(("drive", 2, false));
+    run_until_death(&fake, folder.path());
+    let record = block_on(runner(&fake, folder.path()).resume_unit(&Silent)).expect("resumed");
+    let record = record.expect("the unit");
+    assert_eq!((record.outcome, fake.standing()), (Some(Outcome::Ok), 0));
 }
 
 #[test]

@@ -4,6 +4,7 @@ use super::{Stop, Way};
 use crate::capture::Shot;
 use crate::device::{DeviceError, DriveEnd, DriveProgram, Question, TagValue, tags};
 use crate::ladder::{Cause, Climb, Rung};
+use crate::look::LIKELY_ENOUGH;
 use crate::plan::{SafeTarget, Target};
 use crate::policy::{Case, Choice};
 use crate::record::{Event, FaceRecord, Purpose, Verdict};
@@ -29,7 +30,7 @@ impl Way<'_> {
         let mut not_met = false;
         while let Some(rung) = climb.next(cause, self.bursts(found)) {
             // What is tried for its cover's sake alone and is not met is none; what else may be none is looked at again, but not searched for.
-            if not_met && self.is_doubtful(found) {
+            if not_met && self.is_doubtful(found) && !self.is_worth_a_search(found) {
                 break;
             }
             if matches!(rung, Rung::Search { .. }) && !self.is_worth_a_search(found) {
@@ -69,13 +70,14 @@ impl Way<'_> {
         attempts.filter(|a| a.found == found).map(|a| a.bursts.len()).sum()
     }
 
-    /// True if a find of the face that is being worked on is a screw with enough probability by its picture alone, or a person's word.
-    fn is_worth_a_search(&self, found: usize) -> bool {
+    /// True if a find of the face that is being worked on is a screw with enough probability, or by a person's word.
+    pub(super) fn is_worth_a_search(&self, found: usize) -> bool {
         let find = |face: &FaceRecord| face.found.get(found).map_or(0.0, |find| find.score);
         self.record.faces.last().is_some_and(|face| match face.purpose {
             Purpose::Clicked => true,
             Purpose::Survey | Purpose::Work => find(face) >= WORTH_A_SEARCH,
-            Purpose::Missed | Purpose::LastTry => false,
+            Purpose::Missed => false,
+            Purpose::LastTry => find(face) >= LIKELY_ENOUGH,
         })
     }
 

@@ -9,7 +9,7 @@ use crate::journal::JournalError;
 use crate::ladder::{Cause, Climb, Rung};
 use crate::motion::ArmMotion;
 use crate::plan::{Room, Target};
-use crate::record::{Act, Burst, Event};
+use crate::record::{Act, Burst, Event, Purpose};
 use crate::removal::Mover;
 use crate::schedule::dispatch::{Dispatcher, Event as Told, Work};
 use std::future::{Future, poll_fn};
@@ -151,8 +151,9 @@ impl Way<'_> {
                 ended.error.is_some(),
             );
             // what is tried for its cover's sake alone and is not met is no screw
-            let is_none = ended.end == Some(DriveEnd::MissedHead) && self.is_doubtful(target.found);
+            let not_driven = ended.program.is_none() || ended.end == Some(DriveEnd::MissedHead);
             self.end_burst(target, ended)?;
+            let is_none = not_driven && self.is_doubtful(target.found) && !self.is_worth_a_search(target.found);
             if failed && self.is_in_trouble(target).await {
                 trouble = Some(screw);
             }
@@ -205,7 +206,15 @@ impl Way<'_> {
                 .collect();
             Box::pin(self.drive_out(&left, shot)).await?;
         }
+        // in a last try the cover is pulled at before anything is searched around
+        let pulls_first = |way: &Self| {
+            let face = way.record.faces.last();
+            face.is_some_and(|face| face.purpose == Purpose::LastTry && face.removed() > 0)
+        };
         for (target, tried) in targets.iter().zip(tried) {
+            if pulls_first(self) && self.is_doubtful(target.found) {
+                continue;
+            }
             let stands = self.stands(target.found);
             if let Some(tried) = tried.filter(|t| t.waits && stands) {
                 self.home().await?;
