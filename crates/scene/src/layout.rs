@@ -1779,7 +1779,7 @@ pub(crate) fn unit(seed: u64, options: &UnitOptions) -> Unit {
     }
 }
 
-/// Spoils a unit so that the system cannot do it.
+/// Spoils a unit as those were that the paper excluded.
 fn exclude(faces: &mut [FaceDesign], rng: &mut Rng) -> Exclusion {
     let kind = pick(
         rng,

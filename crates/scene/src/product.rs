@@ -144,7 +144,7 @@ pub enum Theme {
     Greasy,
 }
 
-/// Why a unit cannot be done by the system (the paper's excluded units).
+/// What a unit is spoilt by: why the paper excluded units.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Exclusion {
@@ -154,7 +154,7 @@ pub enum Exclusion {
     DenseWeb,
     /// A screw rusted solid.
     Seized,
-    /// A cover bent so far that its screws lean beyond the driver's range.
+    /// A cover bent so far that its screws lean beyond the range of the paper's driver.
     BentCover,
 }
 
