@@ -275,7 +275,9 @@ fn figure(
     face: &FaceRecord,
     missed: &[Missed],
 ) -> Result<()> {
-    let name = format!("unit{unit:03}-{index:02}-{}.jpg", face.face);
+    // the picture's hash is part of the name: a copy that is there is one of this picture
+    let hash = face.picture.as_ref().map_or("", |id| id.0.get(..8).unwrap_or(&id.0));
+    let name = format!("unit{unit:03}-{index:02}-{}-{hash}.jpg", face.face);
     let shown = shrink(folder, face, &folder.join("report").join(&name))?;
     let (w, h) = (face.width_px, face.height_px);
     write!(
@@ -438,6 +440,9 @@ fn shrink(folder: &Path, face: &FaceRecord, to: &Path) -> Result<bool> {
     let Some(id) = &face.picture else {
         return Ok(false);
     };
+    if to.exists() {
+        return Ok(true); // the page is written after every unit
+    }
     let from = cell::journal::picture_path(folder, id);
     let picture = geometry::read_color(&from)?;
     let width = 1368.min(picture.width());
