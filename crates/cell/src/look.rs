@@ -1,6 +1,8 @@
 //! From a shot to a decision: what the program makes of a picture, and nothing else. The [`Runner`](crate::run::Runner) and a replay
 //! both decide here, so that the same frame, model, maps and cell file give the same decision, byte by byte.
 
+mod earlier;
+
 use crate::capture::Shot;
 use crate::config::CellConfig;
 use crate::device::DeviceError;
@@ -9,6 +11,7 @@ use crate::plane::{FaceFit, sheet_depth_mm, sheet_normal};
 use crate::program::{FaceId, Step};
 use crate::record::{ExclusionReason, FacePlane, FaceRecord, Found, LeftAlone, PullEnd, Purpose, UnitRecord, Verdict};
 use crate::run::Finder;
+use earlier::Earlier;
 use geometry::{Base, CameraModel, Direction, Pixel, Point, RgbdFrame};
 use serde::{Deserialize, Serialize};
 
@@ -149,41 +152,30 @@ impl Judge<'_> {
             clicks,
         } = *question;
         let odds = self.odds(purpose);
-        let looks = || so_far.faces.iter().filter(|f| f.face == *face);
-        let at = |f: &Found| shot.to_shot(Pixel::new(f.u_px, f.v_px));
+        let earlier = Earlier::of(so_far, face, shot);
         // a face that is worked on anew was left in the middle of it
         let is_anew = matches!(purpose, Purpose::Survey | Purpose::Work);
-        let not_met = looks().filter(|_| !is_anew).flat_map(FaceRecord::not_met);
-        let not_met: Vec<(Pixel, bool)> = not_met.map(|(f, tried)| (at(f), tried.searched())).collect();
-        let not_met_by = |s: &vision::Screw, enough: fn(bool) -> bool| {
-            let there = |p: &Pixel| p.distance_px(&s.pixel) < SAME_HEAD * s.diameter_px;
-            not_met.iter().any(|(p, searched)| there(p) && enough(*searched))
-        };
-        let is_not_met = |s: &vision::Screw| not_met_by(s, |_| true);
+        let not_met = |s: &vision::Screw| earlier.not_met(s).filter(|_| !is_anew);
         let mut screws = self.finder.find(&shot.frame, odds)?;
         // What the bit did not meet is not driven at again in the same place; in a last try, what is likely enough is searched around.
-        let is_searched_around = |s: &vision::Screw| {
-            purpose == Purpose::LastTry && s.fits >= LIKELY_ENOUGH && !not_met_by(s, |searched| searched)
+        let is_left = |s: &vision::Screw| {
+            let is_searched_around =
+                |searched: bool| purpose == Purpose::LastTry && s.fits >= LIKELY_ENOUGH && !searched;
+            not_met(s).is_some_and(|searched| !is_searched_around(searched))
         };
         for screw in screws.iter_mut().filter(|s| s.verdict == Verdict::Screw) {
-            if is_not_met(screw) && !is_searched_around(screw) {
+            if is_left(screw) {
                 screw.verdict = Verdict::Review;
             }
         }
-        let mut screws = clicked_on(shot, screws, clicks.unwrap_or_default(), is_not_met);
+        let mut screws = clicked_on(shot, screws, clicks.unwrap_or_default(), |s| not_met(s).is_some());
         let certain = screws
             .iter()
             .filter(|s| !plan::is_doubtful(s.fits, odds) || s.verdict == Verdict::Other);
         let certain = certain.map(|s| (s.pixel, s.diameter_px));
-        let before = looks().rfind(|f| self.odds(f.purpose) == 1.0);
-        let before = before.map_or(&[][..], |f| &f.found);
-        // what is left of a face that has been worked on are its holes: the sheet around them is the face
-        let holes = looks()
-            .flat_map(|f| &f.found)
-            .filter(|f| f.verdict == Verdict::Screw)
-            .map(|f| (at(f), f.diameter_px));
         let mut heads: Vec<(Pixel, f64)> = Vec::new();
-        for (pixel, diameter_px) in certain.chain(holes) {
+        // what is left of a face that has been worked on are its holes: the sheet around them is the face
+        for (pixel, diameter_px) in certain.chain(earlier.screws()) {
             // one that was seen twice has one say
             if heads
                 .iter()
@@ -197,7 +189,7 @@ impl Judge<'_> {
             &mut screws,
             odds,
             config.inspection.doubtful_max,
-            before,
+            earlier.by_pictures_alone(config),
             fit.as_ref(),
             &shot.frame,
         );
@@ -207,12 +199,13 @@ impl Judge<'_> {
         let tops: Vec<_> = tops.filter_map(|s| s.top_normal).collect();
         let fit = fit.map(|fit| match tops.len() {
             // most screws are out already: they have told which way those that are left look
-            0..=2 => fit.with_heads(looks().rev().find_map(|f| f.plane?.heads_normal)),
+            0..=2 => fit.with_heads(earlier.heads_normal()),
             _ => fit.with_heads(fit.look_together(tops.into_iter())),
         });
         let (mut found, targets) = plan::plan(&screws, shot, fit.as_ref(), &self.reaches, config);
-        let seen_but_not_met =
-            |s: &vision::Screw| s.verdict == Verdict::Review && !plan::is_doubtful(s.fits, odds) && is_not_met(s);
+        let seen_but_not_met = |s: &vision::Screw| {
+            s.verdict == Verdict::Review && !plan::is_doubtful(s.fits, odds) && not_met(s) == Some(true)
+        };
         for (find, _) in found.iter_mut().zip(&screws).filter(|(_, s)| seen_but_not_met(s)) {
             find.left_alone = Some(LeftAlone::NotMet);
         }
@@ -231,13 +224,12 @@ impl Judge<'_> {
             attempts: Vec::new(),
         };
         // Excluded is what was out of scope before this face was touched. Once it has been, a failure is a failure.
-        let touched = so_far.faces.iter().any(|f| f.face == *face && !f.attempts.is_empty());
         let least = if purpose == Purpose::Work {
             step.least_screws()
         } else {
             0
         };
-        let excluded = if touched || !matches!(purpose, Purpose::Survey | Purpose::Work) {
+        let excluded = if earlier.touched() || !is_anew {
             None
         } else {
             plan::exclusion(&seen, least, config)

@@ -59,7 +59,7 @@ pub enum LeftAlone {
     OtherDrive,
     /// A person should look.
     Review,
-    /// The bit has not met it where it is seen: only a person can say where it is.
+    /// The bit has not met it where it is seen, nor around: only a person can say where it is.
     NotMet,
     /// There was no depth at it.
     NoDepth,

@@ -137,6 +137,27 @@ impl From<JournalError> for Stop {
     }
 }
 
+/// What was tried at a screw that does not come out; more says more surely that there is one.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+enum Tried {
+    /// The bit was driven at it and met nothing.
+    Once,
+    /// Nor around it.
+    Around,
+    /// It met the recess, or a device failed.
+    Met,
+}
+
+impl Tried {
+    fn at(attempt: &ScrewAttempt) -> Self {
+        match attempt.end() {
+            Some(DriveEnd::MissedHead) if !attempt.met() && attempt.searched() => Self::Around,
+            Some(DriveEnd::MissedHead) if !attempt.met() => Self::Once,
+            _ => Self::Met,
+        }
+    }
+}
+
 /// True if a person's eyes on the picture may take away the reason.
 fn is_for_eyes(reason: ExclusionReason) -> bool {
     matches!(
@@ -943,8 +964,8 @@ impl Way<'_> {
         faces.sort_by(|a, b| (b.1.total_cmp(&a.1)).then(stands_there(b.0).cmp(&stands_there(a.0))));
         // a face without a record has no screws on this product, or cannot be presented yet
         faces.retain(|(face, _)| self.record.faces.iter().any(|f| f.face == **face));
-        // A screw that is known to stand holds the cover: looking for others would not free it. One that the bit has not met may be none, but is likelier
-        // one than what is left for a last try.
+        // A screw that is known to stand holds the cover: looking for others would not free it. One that the bit has not met may be none, unless it was
+        // searched around.
         let asked = self.may_ask().then_some(Purpose::Clicked);
         for purpose in [Some(Purpose::Missed), asked, Some(Purpose::LastTry)]
             .into_iter()
@@ -957,7 +978,8 @@ impl Way<'_> {
             }
             let mut left = faces.iter().map(|(face, _)| *face).collect::<VecDeque<_>>();
             while let Some(face) = left.pop_front() {
-                if let Some(known) = self.known_standing(held_by, |end| last || end != Some(DriveEnd::MissedHead)) {
+                let tried = if last { Tried::Around } else { Tried::Met };
+                if let Some(known) = self.known_standing(held_by, tried) {
                     return Err(Stop::Decided(known));
                 }
                 if self.screws(index, step, face, purpose).await? > 0 {
@@ -972,7 +994,7 @@ impl Way<'_> {
                 }
             }
         }
-        Err(Stop::Decided(self.known_standing(held_by, |_| true).unwrap_or_else(
+        Err(Stop::Decided(self.known_standing(held_by, Tried::Once).unwrap_or_else(
             || Outcome::Ng {
                 reason: NgReason::CoverStuck,
                 detail: format!("the {cover} cover did not come off, and no screw that holds it was seen"),
@@ -998,8 +1020,8 @@ impl Way<'_> {
     /// A screw on these faces that is known to stand, as the reason of a failure.
     ///
     /// # Arguments
-    /// * `counts` – which ends of an attempt say that there is one.
-    fn known_standing(&self, faces: &[FaceId], counts: impl Fn(Option<DriveEnd>) -> bool) -> Option<Outcome> {
+    /// * `least` – what must have been tried at it for that.
+    fn known_standing(&self, faces: &[FaceId], least: Tried) -> Option<Outcome> {
         for face in faces {
             let Some(last) = self.record.faces.iter().rev().find(|f| f.face == *face) else {
                 continue;
@@ -1016,7 +1038,7 @@ impl Way<'_> {
             let failed = last
                 .attempts
                 .iter()
-                .find(|a| !a.removed() && a.still_there != Some(false) && counts(a.end()) && !is_none(a));
+                .find(|a| !a.removed() && a.still_there != Some(false) && Tried::at(a) >= least && !is_none(a));
             if let Some(attempt) = failed {
                 let (reason, what) = match attempt.end() {
                     Some(DriveEnd::Seized) => (NgReason::ScrewSeized, "did not turn"),
@@ -1031,7 +1053,7 @@ impl Way<'_> {
                 });
             }
             let not_met = |f: &Found| f.left_alone == Some(LeftAlone::NotMet);
-            if counts(Some(DriveEnd::MissedHead)) && last.found.iter().any(not_met) {
+            if Tried::Around >= least && last.found.iter().any(not_met) {
                 return Some(Outcome::Ng {
                     reason: NgReason::ScrewMissed,
                     detail: format!("{face}: a screw was not met by the bit, its cover stays"),

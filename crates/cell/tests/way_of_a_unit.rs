@@ -567,6 +567,47 @@ fn before_a_stuck_cover_is_given_up_even_unlikely_heads_are_tried_once() {
 }
 
 #[test]
+fn what_was_not_met_and_not_searched_around_does_not_end_the_search_for_others() {
+    // the top's screw is buried, and what is taken for one with 0.8 is none
+    let buried = |fake: &Fake, odds: f64, found: &mut Vec<vision::Screw>| {
+        if fake.world().presented != "top" {
+            return;
+        }
+        let with = |alone: f64| odds * alone / (odds * alone + 1.0 - alone);
+        let verdict = |fits: f64| match fits {
+            0.6.. => vision::Verdict::Screw,
+            _ => vision::Verdict::Other,
+        };
+        let mut none = None;
+        for screw in found.iter_mut().filter(|s| s.camera.is_none_or(|p| p.x_mm() > 60.0)) {
+            let aside =
+                |p: geometry::Point<geometry::Camera>| geometry::Point::new(p.x_mm() - 150.0, p.y_mm(), p.z_mm());
+            none = Some(vision::Screw {
+                pixel: geometry::Pixel::new(screw.pixel.u_px - 110.0, screw.pixel.v_px),
+                camera: screw.camera.map(aside),
+                fits: with(0.8),
+                ..screw.clone()
+            });
+            screw.fits = with(0.001);
+        }
+        found.extend(none);
+        for screw in found {
+            (screw.score, screw.verdict) = (screw.fits, verdict(screw.fits));
+        }
+    };
+    let fake = Fake::new(&[
+        ("front", vec![screw(0.0, 0.0)]),
+        ("top", vec![screw(0.0, 40.0), screw(90.0, 0.0)]),
+    ]);
+    let folder = tempfile::tempdir().expect("folder");
+    let program = Program::paper().expect("built-in program");
+    let mut runner = runner_with(&fake, folder.path(), program, Altered(fake.clone(), buried));
+    let record = block_on(runner.run_unit(&Silent)).expect("a record");
+    assert_eq!((record.outcome, fake.standing()), (Some(Outcome::Ok), 0));
+    assert!(record.faces.iter().any(|f| f.purpose == Purpose::LastTry));
+}
+
+#[test]
 fn in_a_last_try_a_likely_head_that_was_not_met_is_searched_around() {
     // half behind a cable, the top's screw is in doubt and found 1.6 mm aside
     let hidden = |fake: &Fake, odds: f64, found: &mut Vec<vision::Screw>| {
