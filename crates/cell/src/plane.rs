@@ -81,7 +81,7 @@ impl FaceFit {
 
     /// The plane that the screws of a face sit in: the one in which most heads lie and along whose normal the sheet around most heads looks. Where
     /// much of what shows lies behind the flanges (an open front, a grille), the plane of most of the depth is not the face's; with fewer than
-    /// three heads, or where they do not agree, there is nothing else.
+    /// three heads, or where they do not agree, it is taken all the same if any head lies in it.
     ///
     /// # Arguments
     /// * `heads` – centres of the finds in the picture with the diameters of their heads, px.
@@ -99,17 +99,26 @@ impl FaceFit {
         let best = planes_through(&sheets)
             .into_iter()
             .min_by(|a, b| cost(a).total_cmp(&cost(b)));
-        let fit = best
-            .and_then(|(normal, distance)| refined(&sheets, normal, distance))
-            .filter(|(normal, distance)| is_borne_out(&sheets, &normal.vector(), *distance));
-        match fit {
-            Some((normal, distance_mm)) => Some(Self {
-                normal,
-                distance_mm,
-                heads: None,
-                camera,
-            }),
-            None => Self::of(frame, working_depth_mm),
+        let fit = best.and_then(|(normal, distance)| refined(&sheets, normal, distance));
+        let through_heads = fit.map(|(normal, distance_mm)| Self {
+            normal,
+            distance_mm,
+            heads: None,
+            camera,
+        });
+        if let Some(fit) = through_heads.filter(|fit| is_borne_out(&sheets, &fit.normal.vector(), fit.distance_mm)) {
+            return Some(fit);
+        }
+        // a plane in which no head lies may be that of the background; of two the one that leans less is likelier a face's
+        let holds_a_head = |most: &Self| {
+            let off = |sheet: &Sheet| most.normal.vector().dot(&sheet.at) - most.distance_mm;
+            sheets.iter().any(|sheet| off(sheet).abs() < OFF_PLANE_MM)
+        };
+        match (Self::of(frame, working_depth_mm), through_heads) {
+            (Some(most), Some(fit)) if !holds_a_head(&most) && tilt_rad(fit.normal) < tilt_rad(most.normal) => {
+                Some(fit)
+            }
+            (most, fit) => most.or(fit),
         }
     }
 
@@ -367,6 +376,8 @@ mod tests {
         }
         let most = FaceFit::of(&frame, [1100.0, 1750.0]).expect("a plane").plane();
         assert!((most.tilt_rad - tilt).abs() > 0.1, "the scene should mislead");
+        let few = FaceFit::around(&frame, &heads[..2], [1100.0, 1750.0]).expect("a plane");
+        assert!((few.plane().tilt_rad - tilt).abs() < 0.02, "{:?}", few.plane());
         let fit = FaceFit::around(&frame, &heads, [1100.0, 1750.0]).expect("a plane");
         let plane = fit.plane();
         assert!(

@@ -656,6 +656,10 @@ fn after_a_crash_a_head_that_was_not_met_has_its_ladder_still() {
     run_until_death(&fake, folder.path());
     let record = block_on(runner(&fake, folder.path()).resume_unit(&Silent)).expect("resumed");
     let record = record.expect("the unit");
+    assert!(
+        record.faces.iter().all(|f| f.purpose == Purpose::Work),
+        "no cover stayed for it"
+    );
     assert_eq!((record.outcome, fake.standing()), (Some(Outcome::Ok), 0));
 }
 
