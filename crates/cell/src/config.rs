@@ -145,7 +145,7 @@ pub struct Exclusion {
     pub review_max: usize,
     /// Only candidates with at least this score count.
     pub review_score_min: f64,
-    /// Largest tilt of a face against the camera's axis, rad: ±6° by specification, and 2° for the measurement.
+    /// Largest tilt of a face against the camera's axis, rad: so far the bit follows it.
     pub face_tilt_max_rad: f64,
     /// Largest lean of a face's screws together against the face, rad: so far the bit follows them.
     pub heads_lean_max_rad: f64,
@@ -160,7 +160,7 @@ impl Default for Exclusion {
         Self {
             review_max: 2,
             review_score_min: 0.3,
-            face_tilt_max_rad: 8f64.to_radians(),
+            face_tilt_max_rad: 20f64.to_radians(),
             heads_lean_max_rad: 20f64.to_radians(),
             screw_tilt_max_rad: 11f64.to_radians(),
             bent_max: 0,

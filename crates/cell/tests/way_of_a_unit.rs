@@ -149,7 +149,7 @@ fn excluded_before_anything_is_touched() {
 fn a_bent_face_excludes_and_a_survey_sees_it_before_the_first_screw() {
     let bent = || {
         let fake = Fake::whole();
-        fake.world().tilt_rad.insert("right".into(), 10f64.to_radians());
+        fake.world().tilt_rad.insert("right".into(), 22f64.to_radians());
         fake
     };
     let survey = {
@@ -175,7 +175,7 @@ fn a_bent_face_excludes_and_a_survey_sees_it_before_the_first_screw() {
             "{detail}"
         );
         assert_eq!(fake.calls("drive"), drives);
-        assert!(detail.contains("right") && detail.contains("10.0°"), "{detail}");
+        assert!(detail.contains("right") && detail.contains("22.0°"), "{detail}");
     }
 }
 
