@@ -392,7 +392,13 @@ impl CellConfig {
             );
         }
         for rung in self.ladder.rungs() {
-            if let Rung::Search { places, radius_mm } = *rung {
+            if let Rung::Search {
+                places,
+                radius_mm,
+                deeper_mm,
+            } = *rung
+            {
+                within("ladder.*.deeper_mm", deeper_mm, 0.0, 3.0, "0 to 3 mm")?;
                 within("places of a search", f64::from(places), 1.0, 24.0, "1 to 24")?;
                 within("radius_mm of a search", radius_mm, 0.1, 3.0, "0.1 to 3 mm")?;
             }

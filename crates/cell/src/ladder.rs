@@ -24,6 +24,9 @@ pub enum Rung {
         places: u32,
         /// Its radius, mm.
         radius_mm: f64,
+        /// How much deeper the bit goes than to the last one, mm: what hides a head lies before it, and takes its depth for the head's.
+        #[serde(default)]
+        deeper_mm: f64,
     },
     /// Ask a person where in the picture the screw is, and drive there. Passed over where no person may be asked.
     Click,
@@ -92,10 +95,12 @@ impl Default for Ladder {
         let search = Rung::Search {
             places: 6,
             radius_mm: 0.8,
+            deeper_mm: 0.0,
         };
         let farther = Rung::Search {
             places: 8,
             radius_mm: 1.5,
+            deeper_mm: 2.0,
         };
         Self {
             // looking comes before searching: around what is no screw there is nothing to find

@@ -112,10 +112,10 @@ impl SafeTarget {
         motion.check(joints_rad, self.standoff_pose(), self.contact_pose(), speed_mm_s)
     }
 
-    /// A place so far beside it, across the approach, along the tool's axes; `None` if that or the way to it leaves the volume.
-    pub fn beside(&self, map: &Map, across_mm: [f64; 2]) -> Option<Self> {
+    /// A place so far beside it, across the approach, along the tool's axes, and so much deeper; `None` if that or the way to it leaves the volume.
+    pub fn beside(&self, map: &Map, across_mm: [f64; 2], deeper_mm: f64) -> Option<Self> {
         let tool = tool_pose(self.tip, self.approach);
-        let tip = tool * Point::new(across_mm[0], across_mm[1], 0.0);
+        let tip = tool * Point::new(across_mm[0], across_mm[1], deeper_mm);
         let moved = Self { tip, ..*self };
         let start = tip.moved(self.approach, -self.standoff_mm);
         let volume = map.volume();

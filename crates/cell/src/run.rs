@@ -751,10 +751,15 @@ impl Way<'_> {
         purpose.map_or(1.0, |purpose| look::odds_again(&self.runner.config, purpose))
     }
 
+    /// True if a bit has met a find of the face that is being worked on.
+    fn is_met(&self, found: usize) -> bool {
+        let mut attempts = self.record.faces.last().into_iter().flat_map(|f| &f.attempts);
+        attempts.any(|a| a.found == found && a.met())
+    }
+
     /// True if a find of the face that is being worked on is a target only because its cover did not come off, and no bit has met it yet.
     fn is_doubtful(&self, found: usize) -> bool {
-        let mut attempts = self.record.faces.last().into_iter().flat_map(|f| &f.attempts);
-        if attempts.any(|a| a.found == found && a.met()) {
+        if self.is_met(found) {
             return false;
         }
         // a person's click leaves no doubt
@@ -976,10 +981,12 @@ impl Way<'_> {
             if last && !pulled_again && self.pull(index, step).await? == PullEnd::Off {
                 return Ok(self.log(Event::Recovery { on: false })?);
             }
+            if let Some(known) = self.known_standing(held_by, Tried::Around).filter(|_| last) {
+                return Err(Stop::Decided(known));
+            }
             let mut left = faces.iter().map(|(face, _)| *face).collect::<VecDeque<_>>();
             while let Some(face) = left.pop_front() {
-                let tried = if last { Tried::Around } else { Tried::Met };
-                if let Some(known) = self.known_standing(held_by, tried) {
+                if let Some(known) = self.known_standing(held_by, Tried::Met) {
                     return Err(Stop::Decided(known));
                 }
                 if self.screws(index, step, face, purpose).await? > 0 {

@@ -12,6 +12,14 @@ use crate::record::{Event, FaceRecord, Purpose, Verdict};
 /// A head is searched around if it is a screw with so much probability.
 const WORTH_A_SEARCH: f64 = 0.9;
 
+/// Places on a ring, across the approach, mm.
+fn ring(places: u32, radius_mm: f64) -> impl Iterator<Item = [f64; 2]> {
+    (0..places).map(move |step| {
+        let angle = std::f64::consts::TAU * f64::from(step) / f64::from(places);
+        [radius_mm * angle.cos(), radius_mm * angle.sin()]
+    })
+}
+
 impl Way<'_> {
     /// Tries one rung after the other until the screw is out, is not there, or nothing is left. The other arm rests.
     ///
@@ -42,7 +50,14 @@ impl Way<'_> {
                     None => break,
                 },
                 Rung::Drive { program } => self.burst(found, place, program, None).await?,
-                Rung::Search { places, radius_mm } => self.search(found, place, first, places, radius_mm).await?,
+                Rung::Search {
+                    places,
+                    radius_mm,
+                    deeper_mm,
+                } => {
+                    let ring = ring(places, radius_mm);
+                    self.search(found, place, first, ring, deeper_mm).await?
+                }
                 Rung::LookAgain | Rung::Click => {
                     let asks = rung == Rung::Click;
                     if asks && !self.may_ask() {
@@ -87,18 +102,16 @@ impl Way<'_> {
         found: usize,
         place: SafeTarget,
         program: DriveProgram,
-        places: u32,
-        radius_mm: f64,
+        ring: impl Iterator<Item = [f64; 2]>,
+        deeper_mm: f64,
     ) -> Result<Option<DriveEnd>, Stop> {
         let mut end = Some(DriveEnd::MissedHead);
-        for step in 0..places {
+        for across_mm in ring {
             if end != Some(DriveEnd::MissedHead) {
                 break;
             }
-            let angle = std::f64::consts::TAU * f64::from(step) / f64::from(places);
-            let across_mm = [radius_mm * angle.cos(), radius_mm * angle.sin()];
             let map = self.runner.maps.get(place.arm());
-            if let Some(beside) = map.and_then(|map| place.beside(map, across_mm)) {
+            if let Some(beside) = map.and_then(|map| place.beside(map, across_mm, deeper_mm)) {
                 end = self.burst(found, beside, program, None).await?;
             }
         }

@@ -212,7 +212,7 @@ impl Way<'_> {
             face.is_some_and(|face| face.purpose == Purpose::LastTry && face.removed() > 0)
         };
         for (target, tried) in targets.iter().zip(tried) {
-            if pulls_first(self) && self.is_doubtful(target.found) {
+            if pulls_first(self) && !self.is_met(target.found) {
                 continue;
             }
             let stands = self.stands(target.found);
