@@ -437,8 +437,17 @@ impl CellConfig {
             far,
             "nearer than the far end",
         )?;
-        let tilt = self.exclusion.screw_tilt_max_rad;
-        within("exclusion.screw_tilt_max_rad", tilt, 0.0, 0.5, "at most 0.5 rad")?;
+        let rules = &self.exclusion;
+        for tilt in [
+            rules.screw_tilt_max_rad,
+            rules.face_tilt_max_rad,
+            rules.heads_lean_max_rad,
+        ] {
+            within("exclusion.*_max_rad", tilt, 0.0, 0.5, "at most 0.5 rad")?;
+        }
+        for odds in [self.inspection.stuck_cover_odds, self.inspection.last_try_odds] {
+            within("inspection.*_odds", odds, 1.0, 1e9, "1 to 1e9")?;
+        }
         let quality = f64::from(self.journal.jpeg_quality);
         within("journal.jpeg_quality", quality, 1.0, 100.0, "1 to 100")?;
         let times = &self.timeouts;

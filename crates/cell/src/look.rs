@@ -376,7 +376,8 @@ fn clicked_on(
                 if let Some(shown) = is_not_met(screw).then(|| seen_by_a_person(shot, pixel)).flatten() {
                     *screw = shown;
                 }
-                screw.verdict = Verdict::Screw;
+                // a person's word leaves no doubt
+                (screw.verdict, screw.score, screw.fits) = (Verdict::Screw, 1.0, 1.0);
             }
             None => screws.extend(seen_by_a_person(shot, pixel)),
         }

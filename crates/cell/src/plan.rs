@@ -433,7 +433,10 @@ fn target(
         return Err(LeftAlone::HeadSize.into());
     }
     let normal = line_of_approach(sheet, screw.top_normal, face, config).ok_or(LeftAlone::NoDepth)?;
-    let askew = leaning(sheet, head_normal(screw), normal.vector());
+    // one measurement alone may be that of an edge
+    let askew = screw
+        .top_normal
+        .and_then(|top| leaning(sheet, Some(top), normal.vector()));
     if askew.is_some_and(|lean| lean > config.exclusion.screw_tilt_max_rad) {
         return Err(LeftAlone::Bent.into());
     }

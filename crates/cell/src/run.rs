@@ -31,6 +31,9 @@ use std::time::Duration;
 /// How often a held cell looks whether it may go on, s.
 const HELD_POLL_S: f64 = 0.1;
 
+/// Looks at a face at most to try what is left on it.
+const LAST_TRIES: usize = 3;
+
 /// Finds screws in a shot. [`vision::Detector`] does; tests have their own.
 pub trait Finder: Send + Sync {
     /// Every candidate, in pixels of the shot, and in the camera's frame where it has depth.
@@ -995,7 +998,11 @@ impl Way<'_> {
                         return Ok(self.log(Event::Recovery { on: false })?);
                     }
                     // one that nobody saw is seldom alone
-                    if last {
+                    let looks = self.record.faces.iter();
+                    let tries = looks
+                        .filter(|f| f.face == *face && f.purpose == Purpose::LastTry)
+                        .count();
+                    if last && tries < LAST_TRIES {
                         left.push_front(face);
                     }
                 }

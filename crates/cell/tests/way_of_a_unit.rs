@@ -608,6 +608,35 @@ fn what_was_not_met_and_not_searched_around_does_not_end_the_search_for_others()
 }
 
 #[test]
+fn a_last_try_ends() {
+    // what only a last try takes for a screw never ends in time, and the picture after it says each time that it is gone
+    let ghost = |fake: &Fake, odds: f64, found: &mut Vec<vision::Screw>| {
+        let on_top = fake.world().presented == "top";
+        let is_ghost = |s: &vision::Screw| on_top && s.camera.is_none_or(|p| p.x_mm() > 60.0);
+        found.retain(|s| odds > 1000.0 || !is_ghost(s));
+        for screw in found.iter_mut().filter(|s| is_ghost(s)) {
+            (screw.score, screw.fits) = (0.9, 0.9);
+        }
+    };
+    let never = [DriveEnd::TimeOut; 50];
+    let fake = Fake::new(&[
+        ("front", vec![screw(0.0, 0.0)]),
+        ("top", vec![screw(0.0, 0.0), screw_that_ends(90.0, 0.0, &never)]),
+    ]);
+    let folder = tempfile::tempdir().expect("folder");
+    let program = Program::paper().expect("built-in program");
+    let mut runner = runner_with(&fake, folder.path(), program, Altered(fake.clone(), ghost));
+    let record = block_on(runner.run_unit(&Silent)).expect("a record");
+    assert!(
+        matches!(record.outcome, Some(Outcome::Ng { .. })),
+        "{:?}",
+        record.outcome
+    );
+    let top = record.faces.iter().filter(|f| f.face.0 == "top");
+    assert_eq!(top.filter(|f| f.purpose == Purpose::LastTry).count(), 3);
+}
+
+#[test]
 fn in_a_last_try_a_likely_head_that_was_not_met_is_searched_around() {
     // half behind a cable, the top's screw is in doubt and found 1.6 mm aside and 4 mm before its place
     let hidden = |fake: &Fake, odds: f64, found: &mut Vec<vision::Screw>| {

@@ -107,7 +107,7 @@ impl Way<'_> {
     ) -> Result<Option<DriveEnd>, Stop> {
         let mut end = Some(DriveEnd::MissedHead);
         for across_mm in ring {
-            if end != Some(DriveEnd::MissedHead) {
+            if end != Some(DriveEnd::MissedHead) || self.bursts(found) >= self.runner.config.ladder.bursts_max {
                 break;
             }
             let map = self.runner.maps.get(place.arm());
