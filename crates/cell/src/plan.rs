@@ -579,21 +579,26 @@ mod tests {
         assert_eq!(leaning(None, None, -Vector3::z()), None);
     }
 
-    #[test]
-    fn the_bit_follows_the_face_unless_sheet_and_head_lean_alike() {
-        let towards = |degrees: f64| {
-            let (sin, cos) = degrees.to_radians().sin_cos();
-            Direction::<Camera>::new(sin, 0.0, -cos)
-        };
-        let camera = geometry::CameraModel::pinhole(800, 600, 900.0, 900.0);
+    fn towards(degrees: f64) -> Option<Direction<Camera>> {
+        let (sin, cos) = degrees.to_radians().sin_cos();
+        Direction::new(sin, 0.0, -cos)
+    }
+
+    /// A face that looks straight at the camera, its heads perhaps not.
+    fn straight_face(heads_normal: Option<Direction<Camera>>) -> FaceFit {
         let plane = crate::record::FacePlane {
             depth_mm: 1500.0,
             tilt_rad: 0.0,
             normal: towards(0.0),
             heads_lean_rad: None,
-            heads_normal: None,
+            heads_normal,
         };
-        let face = FaceFit::known(&plane, camera).expect("known");
+        FaceFit::known(&plane, geometry::CameraModel::pinhole(800, 600, 900.0, 900.0)).expect("known")
+    }
+
+    #[test]
+    fn the_bit_follows_the_face_unless_sheet_and_head_lean_alike() {
+        let face = straight_face(None);
         let config = CellConfig::simulated();
         let line = |sheet: f64, head: f64| {
             let line = line_of_approach(towards(sheet), towards(head), Some(&face), &config).expect("a line");
@@ -607,20 +612,8 @@ mod tests {
 
     #[test]
     fn on_a_bent_cover_the_bit_follows_what_all_heads_say() {
-        let towards = |degrees: f64| {
-            let (sin, cos) = degrees.to_radians().sin_cos();
-            Direction::<Camera>::new(sin, 0.0, -cos)
-        };
-        let camera = geometry::CameraModel::pinhole(800, 600, 900.0, 900.0);
         let line = |heads: f64, own: f64| {
-            let plane = crate::record::FacePlane {
-                depth_mm: 1500.0,
-                tilt_rad: 0.0,
-                normal: towards(0.0),
-                heads_lean_rad: None,
-                heads_normal: towards(heads),
-            };
-            let face = FaceFit::known(&plane, camera).expect("known");
+            let face = straight_face(towards(heads));
             let sheet = towards(0.0);
             let line = line_of_approach(sheet, towards(own), Some(&face), &CellConfig::simulated());
             line.expect("a line").angle_rad(face.normal()).to_degrees()

@@ -56,6 +56,14 @@ fn run(fake: &Fake) -> UnitRecord {
     block_on(runner(fake, folder.path()).run_unit(&Silent)).expect("a record")
 }
 
+/// A run whose finder tells what the fake finds with something done to it.
+fn run_altered(fake: &Fake, alter: impl Fn(&Fake, f64, &mut Vec<vision::Screw>) + Send + Sync + 'static) -> UnitRecord {
+    let folder = tempfile::tempdir().expect("folder");
+    let program = Program::paper().expect("built-in program");
+    let mut runner = runner_with(fake, folder.path(), program, Altered(fake.clone(), alter));
+    block_on(runner.run_unit(&Silent)).expect("a record")
+}
+
 /// Runs until the program dies in the call that the fake was told of.
 fn run_until_death(fake: &Fake, folder: &Path) {
     block_on(async {
@@ -456,10 +464,7 @@ fn a_stuck_cover_settles_the_doubt_about_a_head() {
         ("front", vec![screw(0.0, 0.0)]),
         ("top", vec![screw(0.0, 0.0), screw(90.0, 0.0)]),
     ]);
-    let folder = tempfile::tempdir().expect("folder");
-    let program = Program::paper().expect("built-in program");
-    let mut runner = runner_with(&fake, folder.path(), program, Altered(fake.clone(), doubt));
-    let record = block_on(runner.run_unit(&Silent)).expect("a record");
+    let record = run_altered(&fake, doubt);
     assert_eq!(record.outcome, Some(Outcome::Ok));
     assert_eq!(
         fake.entries(&["PULL"]),
@@ -498,10 +503,7 @@ fn on_a_stuck_cover_only_the_likeliest_doubtful_heads_are_tried() {
         ("front", vec![screw(0.0, 0.0)]),
         ("top", vec![screw(0.0, 0.0), screw(90.0, 0.0)]),
     ]);
-    let folder = tempfile::tempdir().expect("folder");
-    let program = Program::paper().expect("built-in program");
-    let mut runner = runner_with(&fake, folder.path(), program, Altered(fake.clone(), grille));
-    let record = block_on(runner.run_unit(&Silent)).expect("a record");
+    let record = run_altered(&fake, grille);
     assert!(
         matches!(record.outcome, Some(Outcome::Ng { .. })),
         "{:?}",
@@ -548,10 +550,7 @@ fn before_a_stuck_cover_is_given_up_even_unlikely_heads_are_tried_once() {
         ("front", vec![screw(0.0, 0.0)]),
         ("top", vec![screw(0.0, 0.0), screw(90.0, 0.0)]),
     ]);
-    let folder = tempfile::tempdir().expect("folder");
-    let program = Program::paper().expect("built-in program");
-    let mut runner = runner_with(&fake, folder.path(), program, Altered(fake.clone(), buried));
-    let record = block_on(runner.run_unit(&Silent)).expect("a record");
+    let record = run_altered(&fake, buried);
     assert_eq!(record.outcome, Some(Outcome::Ok));
     let tries = |purpose: Purpose| {
         let looks = record.faces.iter().filter(move |f| f.purpose == purpose);
@@ -599,10 +598,7 @@ fn what_was_not_met_and_not_searched_around_does_not_end_the_search_for_others()
         ("front", vec![screw(0.0, 0.0)]),
         ("top", vec![screw(0.0, 40.0), screw(90.0, 0.0)]),
     ]);
-    let folder = tempfile::tempdir().expect("folder");
-    let program = Program::paper().expect("built-in program");
-    let mut runner = runner_with(&fake, folder.path(), program, Altered(fake.clone(), buried));
-    let record = block_on(runner.run_unit(&Silent)).expect("a record");
+    let record = run_altered(&fake, buried);
     assert_eq!((record.outcome, fake.standing()), (Some(Outcome::Ok), 0));
     assert!(record.faces.iter().any(|f| f.purpose == Purpose::LastTry));
 }
@@ -623,10 +619,7 @@ fn a_last_try_ends() {
         ("front", vec![screw(0.0, 0.0)]),
         ("top", vec![screw(0.0, 0.0), screw_that_ends(90.0, 0.0, &never)]),
     ]);
-    let folder = tempfile::tempdir().expect("folder");
-    let program = Program::paper().expect("built-in program");
-    let mut runner = runner_with(&fake, folder.path(), program, Altered(fake.clone(), ghost));
-    let record = block_on(runner.run_unit(&Silent)).expect("a record");
+    let record = run_altered(&fake, ghost);
     assert!(
         matches!(record.outcome, Some(Outcome::Ng { .. })),
         "{:?}",
@@ -659,10 +652,7 @@ fn in_a_last_try_a_likely_head_that_was_not_met_is_searched_around() {
         ("front", vec![screw(0.0, 0.0)]),
         ("top", vec![screw(0.0, 0.0), screw(90.0, 0.0)]),
     ]);
-    let folder = tempfile::tempdir().expect("folder");
-    let program = Program::paper().expect("built-in program");
-    let mut runner = runner_with(&fake, folder.path(), program, Altered(fake.clone(), hidden));
-    let record = block_on(runner.run_unit(&Silent)).expect("a record");
+    let record = run_altered(&fake, hidden);
     assert_eq!((record.outcome, fake.standing()), (Some(Outcome::Ok), 0));
     let tries = |purpose: Purpose| {
         let looks = record.faces.iter().filter(move |f| f.purpose == purpose);
@@ -706,10 +696,7 @@ fn a_stuck_cover_s_screw_is_looked_for_first_where_a_head_was_in_doubt() {
         ("left", vec![screw(0.0, 0.0)]),
         ("front_inner", vec![screw(50.0, 0.0)]),
     ]);
-    let folder = tempfile::tempdir().expect("folder");
-    let program = Program::paper().expect("built-in program");
-    let mut runner = runner_with(&fake, folder.path(), program, Altered(fake.clone(), doubt));
-    let record = block_on(runner.run_unit(&Silent)).expect("a record");
+    let record = run_altered(&fake, doubt);
     assert_eq!(record.outcome, Some(Outcome::Ok));
     let again = record.faces.iter().filter(|f| f.purpose == Purpose::Missed);
     assert_eq!(again.map(|f| f.face.0.as_str()).collect::<Vec<_>>(), ["left"]);
@@ -726,10 +713,7 @@ fn a_screw_that_is_seen_but_not_met_is_searched_for_around_its_place() {
         }
     };
     let fake = Fake::new(&[("front", vec![screw(10.0, 20.0)])]);
-    let folder = tempfile::tempdir().expect("folder");
-    let program = Program::paper().expect("built-in program");
-    let mut runner = runner_with(&fake, folder.path(), program, Altered(fake.clone(), off));
-    let record = block_on(runner.run_unit(&Silent)).expect("a record");
+    let record = run_altered(&fake, off);
     assert_eq!(record.outcome, Some(Outcome::Ok));
     assert_eq!((fake.standing(), record.screws_out()), (0, 1));
     let drives = fake.calls("drive");
