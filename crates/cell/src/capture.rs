@@ -178,14 +178,21 @@ pub fn camera_of_region(whole: &CameraModel, region: Region) -> CameraModel {
 
 /// The region of the picture around a pixel, aligned for depth; `None` if nothing of it lies in the picture.
 pub fn region_around(camera: &CameraModel, pixel: Pixel, half_px: f64) -> Option<Region> {
-    let span = |c: f64, size: u32| {
-        let low = ((c - half_px).max(0.0) as u32) / REGION_GRID_PX * REGION_GRID_PX;
-        let high = ((c + half_px).ceil().max(0.0) as u32).div_ceil(REGION_GRID_PX) * REGION_GRID_PX;
+    region_of(camera, &[pixel], half_px)
+}
+
+/// The region of the picture that holds all these pixels, inside the picture or not, and so much around them; `None` as for one.
+pub fn region_of(camera: &CameraModel, pixels: &[Pixel], around_px: f64) -> Option<Region> {
+    let span = |along: fn(&Pixel) -> f64, size: u32| {
+        let all = pixels.iter().map(along);
+        let (low, high) = (all.clone().reduce(f64::min)?, all.reduce(f64::max)?);
+        let low = ((low - around_px).max(0.0) as u32) / REGION_GRID_PX * REGION_GRID_PX;
+        let high = ((high + around_px).ceil().max(0.0) as u32).div_ceil(REGION_GRID_PX) * REGION_GRID_PX;
         let high = high.min(size);
         (high > low).then(|| (low, high - low))
     };
-    let (x_px, width_px) = span(pixel.u_px, camera.width_px)?;
-    let (y_px, height_px) = span(pixel.v_px, camera.height_px)?;
+    let (x_px, width_px) = span(|p| p.u_px, camera.width_px)?;
+    let (y_px, height_px) = span(|p| p.v_px, camera.height_px)?;
     Some(Region {
         x_px,
         y_px,

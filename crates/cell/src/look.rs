@@ -26,8 +26,10 @@ const USUAL_HEAD_MM: f64 = 9.5;
 const USUAL_HEAD_PX: f64 = 30.0;
 /// Height of its recess's rim above the sheet, mm.
 const USUAL_RIM_MM: f64 = 2.5;
-/// In a last try a head is searched around if it is a screw with so much probability, the odds of that included: two in a hundred by its picture.
-pub(crate) const LIKELY_ENOUGH: f64 = 0.995;
+/// A head is searched around if its picture alone makes it a screw with so much probability;
+const WORTH_A_SEARCH: f64 = 0.9;
+/// in a last try with so much, the odds of that included: two in a hundred by its picture.
+const LIKELY_ENOUGH: f64 = 0.995;
 /// Standard error of a click, px.
 const CLICK_PX: f64 = 1.5;
 
@@ -157,11 +159,9 @@ impl Judge<'_> {
         let is_anew = matches!(purpose, Purpose::Survey | Purpose::Work);
         let not_met = |s: &vision::Screw| earlier.not_met(s).filter(|_| !is_anew);
         let mut screws = self.finder.find(&shot.frame, odds)?;
-        // What the bit did not meet is not driven at again in the same place; in a last try, what is likely enough is searched around.
+        // What the bit did not meet is not driven at again in the same place; what is likely enough is searched around, once.
         let is_left = |s: &vision::Screw| {
-            let is_searched_around =
-                |searched: bool| purpose == Purpose::LastTry && s.fits >= LIKELY_ENOUGH && !searched;
-            not_met(s).is_some_and(|searched| !is_searched_around(searched))
+            not_met(s).is_some_and(|searched| searched || !is_worth_a_search(s.fits, purpose, config))
         };
         for screw in screws.iter_mut().filter(|s| s.verdict == Verdict::Screw) {
             if is_left(screw) {
@@ -191,7 +191,7 @@ impl Judge<'_> {
             config.inspection.doubtful_max,
             earlier.by_pictures_alone(config),
             fit.as_ref(),
-            &shot.frame,
+            shot,
         );
         let tops = screws
             .iter()
@@ -202,7 +202,18 @@ impl Judge<'_> {
             0..=2 => fit.with_heads(earlier.heads_normal()),
             _ => fit.with_heads(fit.look_together(tops.into_iter())),
         });
-        let (mut found, targets) = plan::plan(&screws, shot, fit.as_ref(), &self.reaches, config);
+        // Nobody is asked before a cover stays: what rather costs a pull than a mark is tried, and stays in doubt for the record.
+        let is_tried = |s: &vision::Screw| {
+            is_anew && s.verdict == Verdict::Review && s.fits >= config.inspection.try_in_doubt_from
+        };
+        let mut tried = screws.clone();
+        for screw in tried.iter_mut().filter(|s| is_tried(s)) {
+            screw.verdict = Verdict::Screw;
+        }
+        let (mut found, targets) = plan::plan(&tried, shot, fit.as_ref(), &self.reaches, config);
+        for (find, screw) in found.iter_mut().zip(&screws) {
+            find.verdict = screw.verdict;
+        }
         let seen_but_not_met = |s: &vision::Screw| {
             s.verdict == Verdict::Review && !plan::is_doubtful(s.fits, odds) && not_met(s) == Some(true)
         };
@@ -217,8 +228,10 @@ impl Judge<'_> {
             purpose,
             t_s: shot.frame.t_s,
             picture: None,
-            width_px: shot.frame.color.width(),
-            height_px: shot.frame.color.height(),
+            left_px: shot.region.x_px,
+            top_px: shot.region.y_px,
+            width_px: shot.region.width_px,
+            height_px: shot.region.height_px,
             plane,
             found,
             attempts: Vec::new(),
@@ -317,6 +330,20 @@ pub fn odds_again(config: &CellConfig, purpose: Purpose) -> f64 {
     match purpose {
         Purpose::Clicked | Purpose::LastTry => config.inspection.stuck_cover_odds,
         other => odds(config, other),
+    }
+}
+
+/// True if a head that the bit did not meet is to be searched around.
+///
+/// # Arguments
+/// * `fits` – its probability with the odds of the purpose.
+pub fn is_worth_a_search(fits: f64, purpose: Purpose, config: &CellConfig) -> bool {
+    match purpose {
+        Purpose::Clicked => true,
+        Purpose::Survey | Purpose::Work | Purpose::Missed => {
+            plan::without_odds(fits, odds(config, purpose)) >= WORTH_A_SEARCH
+        }
+        Purpose::LastTry => fits >= LIKELY_ENOUGH,
     }
 }
 
@@ -510,6 +537,8 @@ mod tests {
             purpose: Purpose::Work,
             t_s: 0.0,
             picture: None,
+            left_px: 0,
+            top_px: 0,
             width_px: 800,
             height_px: 600,
             plane: None,

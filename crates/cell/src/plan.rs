@@ -6,13 +6,14 @@
 
 mod allot;
 
-use crate::capture::Shot;
+use crate::capture::{Shot, region_of};
 use crate::config::{Approach, CellConfig};
+use crate::device::Region;
 use crate::motion::{ArmMotion, Refusal, Way};
 use crate::plane::{FaceFit, sheet_normal, tilt_rad};
 use crate::record::{ExclusionReason, FaceRecord, Found, Hull, LeftAlone, Verdict};
 use calibration::{Map, MappedPoint};
-use geometry::{Base, Camera, Direction, Point, RgbdFrame, Tool, Transform};
+use geometry::{Base, Camera, CameraModel, Direction, Pixel, Point, Tool, Transform};
 use nalgebra::{Matrix3, Rotation3, UnitQuaternion, Vector3};
 
 /// Shortest way in front of a screw on which the bit can still be lined up, mm.
@@ -242,6 +243,24 @@ impl<'a> Reach<'a> {
     }
 }
 
+/// The part of the picture in which there can be a target: the calibrated volumes as the camera sees them, and a head's width more. `None` if that
+/// cannot be told, or the camera sees nothing of them.
+pub fn region_in_reach<'a>(
+    camera: &CameraModel,
+    maps: impl IntoIterator<Item = &'a Map>,
+    head_mm: f64,
+) -> Option<Region> {
+    let corners = maps.into_iter().flat_map(|map| {
+        let camera_from_base = map.base_from_camera().inverse();
+        (0..8).map(move |k| camera_from_base * map.volume().at([k & 1, k >> 1 & 1, k >> 2].map(f64::from)))
+    });
+    let corners: Vec<Point<Camera>> = corners.collect();
+    let nearest_mm = corners.iter().map(Point::z_mm).reduce(f64::min)?;
+    // a volume that begins behind the camera may show anywhere
+    let pixels: Option<Vec<Pixel>> = corners.iter().map(|corner| camera.project(*corner)).collect();
+    region_of(camera, &pixels?, head_mm / camera.pixel_mm(nearest_mm).max(1e-6))
+}
+
 /// Why an arm is not sent to a find.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Refused {
@@ -285,13 +304,23 @@ impl Refused {
     }
 }
 
-/// True if the picture alone rather says that it is no screw: only the odds of a stuck cover speak for it.
+/// What the picture alone says.
 ///
 /// # Arguments
 /// * `fits` – probability with the odds.
 /// * `odds` – how much likelier other evidence makes it than the picture says.
+pub fn without_odds(fits: f64, odds: f64) -> f64 {
+    fits / (fits + odds * (1.0 - fits))
+}
+
+/// True if the picture alone rather says that it is no screw: only the odds of a stuck cover speak for it.
 pub fn is_doubtful(fits: f64, odds: f64) -> bool {
-    fits < odds * (1.0 - fits)
+    without_odds(fits, odds) < 0.5
+}
+
+/// The same of a find that was driven at or could have been.
+pub fn was_doubtful(find: &Found, odds: f64) -> bool {
+    find.verdict == Verdict::Review || is_doubtful(find.score, odds)
 }
 
 /// Leaves of the doubtful heads the `most` likely ones; the others are for a person to look at. One missed screw holds a cover: that is
@@ -307,7 +336,7 @@ pub fn bound_doubtful(
     most: usize,
     before: &[Found],
     face: Option<&FaceFit>,
-    frame: &RgbdFrame,
+    shot: &Shot,
 ) {
     let on_face = |screw: &vision::Screw| {
         let (Some(face), Some(at)) = (face, screw.camera) else {
@@ -315,21 +344,23 @@ pub fn bound_doubtful(
         };
         let off_mm = (at.z_mm() - face.depth_mm(screw.pixel)).abs();
         let looks_the_same_way = || {
-            let sheet = sheet_normal(frame, screw.pixel, screw.diameter_px);
+            let sheet = sheet_normal(&shot.frame, screw.pixel, screw.diameter_px);
             sheet.is_some_and(|sheet| sheet.angle_rad(face.normal()) <= SAME_WAY_AS_FACE_RAD)
         };
         off_mm <= ON_FACE_MM || off_mm <= PLATES_MM && looks_the_same_way()
     };
     let seen_before = |screw: &vision::Screw| {
-        let near = |f: &&Found| (f.u_px - screw.pixel.u_px).hypot(f.v_px - screw.pixel.v_px) < screw.diameter_px;
+        let at = shot.to_whole(screw.pixel);
+        let near = |f: &&Found| at.distance_px(&Pixel::new(f.u_px, f.v_px)) < screw.diameter_px;
         let in_doubt = before.iter().filter(|f| f.verdict == Verdict::Review).filter(near);
         in_doubt.map(|f| f.score).fold(0.0, f64::max)
     };
     let doubtful = screws
         .iter_mut()
         .filter(|s| s.verdict == Verdict::Screw && is_doubtful(s.fits, odds));
-    let alone = |s: &vision::Screw| s.fits / (s.fits + odds * (1.0 - s.fits));
-    let mut doubtful: Vec<(f64, &mut vision::Screw)> = doubtful.map(|s| (alone(s).max(seen_before(s)), s)).collect();
+    let mut doubtful: Vec<(f64, &mut vision::Screw)> = doubtful
+        .map(|s| (without_odds(s.fits, odds).max(seen_before(s)), s))
+        .collect();
     doubtful.sort_by(|a, b| b.0.total_cmp(&a.0));
     let (likely, behind): (Vec<_>, Vec<_>) = doubtful.into_iter().partition(|(_, s)| on_face(s));
     for (_, screw) in likely.into_iter().skip(most).chain(behind) {

@@ -226,9 +226,15 @@ pub struct FaceRecord {
     pub t_s: f64,
     /// The picture, if pictures are kept.
     pub picture: Option<PictureId>,
-    /// Width of the picture, px.
+    /// First column of the camera's whole picture that was read out, px.
+    #[serde(default)]
+    pub left_px: u32,
+    /// First row of it, px.
+    #[serde(default)]
+    pub top_px: u32,
+    /// Width of what was read out, px.
     pub width_px: u32,
-    /// Height of the picture, px.
+    /// Height of what was read out, px.
     pub height_px: u32,
     /// Plane of the face, if it could be measured.
     pub plane: Option<FacePlane>,
@@ -870,6 +876,8 @@ mod tests {
             purpose: Purpose::Work,
             t_s: 12.0,
             picture: None,
+            left_px: 0,
+            top_px: 0,
             width_px: 40,
             height_px: 30,
             plane: None,

@@ -650,7 +650,10 @@ impl Way<'_> {
         self.turn(face).await?;
         self.laid_aside().await?;
         let config = self.runner.config.clone();
-        let shot = shoot(&self.runner.devices, None, config.inspection.depth_frames).await?;
+        let devices = &self.runner.devices;
+        let maps = self.reaches().into_iter().map(|reach| reach.map);
+        let region = plan::region_in_reach(&devices.color.intrinsics(), maps, config.inspection.head_mm[1]);
+        let shot = shoot(devices, region, config.inspection.depth_frames).await?;
         let clicks = if purpose == Purpose::Clicked {
             let text = format!("Which heads on the {face} are cross screws that still stand?");
             self.ask(&shot, &text).await?
@@ -744,7 +747,7 @@ impl Way<'_> {
         // a person's click leaves no doubt
         let face = self.record.faces.last().filter(|f| f.purpose != Purpose::Clicked);
         face.and_then(|f| Some((f.found.get(found)?, look::odds(&self.runner.config, f.purpose))))
-            .is_some_and(|(find, odds)| plan::is_doubtful(find.score, odds))
+            .is_some_and(|(find, odds)| plan::was_doubtful(find, odds))
     }
 
     /// Lets the time pass that computing on a picture is budgeted with.

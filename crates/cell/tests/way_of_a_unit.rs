@@ -7,8 +7,8 @@ use cell::journal::Journal;
 use cell::program::Program;
 use cell::record::{Act, ExclusionReason, LeftAlone, NgReason, Outcome, PullEnd, Purpose, SeenBy, UnitRecord};
 use cell::run::{RunError, Runner, Silent};
-use fake::{Fake, base_from_camera, config, map, screw, screw_that_ends, volume};
-use geometry::Point;
+use fake::{Fake, base_from_camera, camera, config, map, screw, screw_that_ends, volume};
+use geometry::{Pixel, Point};
 use nalgebra::Vector3;
 use std::path::Path;
 use std::sync::Arc;
@@ -455,9 +455,9 @@ fn a_stuck_cover_settles_the_doubt_about_a_head() {
     let doubt = |fake: &Fake, odds: f64, found: &mut Vec<vision::Screw>| {
         if fake.world().presented == "top" && odds == 1.0 {
             let right = found.iter_mut().max_by(|a, b| a.pixel.u_px.total_cmp(&b.pixel.u_px));
-            right
-                .into_iter()
-                .for_each(|head| head.verdict = vision::Verdict::Review);
+            for head in right {
+                (head.score, head.fits, head.verdict) = (0.25, 0.25, vision::Verdict::Review);
+            }
         }
     };
     let fake = Fake::new(&[
@@ -471,6 +471,53 @@ fn a_stuck_cover_settles_the_doubt_about_a_head() {
         ["PULL_TOP", "PULL_TOP", "PULL_FRONT", "PULL_RIGHT"]
     );
     assert!(record.times.recovery_s > 5.0);
+}
+
+#[test]
+fn a_head_that_is_as_likely_a_screw_as_not_is_tried_at_once_and_stays_in_doubt_for_the_record() {
+    // of two heads in doubt on the top one is a screw; around the other one nothing is searched
+    let doubt = |fake: &Fake, _: f64, found: &mut Vec<vision::Screw>| {
+        if fake.world().presented == "top"
+            && let Some(mark) = found.first().cloned()
+        {
+            found.push(vision::Screw {
+                pixel: Pixel::new(mark.pixel.u_px + 40.0, mark.pixel.v_px),
+                camera: mark.camera.map(|p| Point::new(p.x_mm() + 60.0, p.y_mm(), p.z_mm())),
+                ..mark
+            });
+            for head in found {
+                (head.score, head.fits, head.verdict) = (0.45, 0.45, vision::Verdict::Review);
+            }
+        }
+    };
+    let fake = Fake::new(&[("front", vec![screw(0.0, 0.0)]), ("top", vec![screw(0.0, 0.0)])]);
+    let record = run_altered(&fake, doubt);
+    assert_eq!(record.outcome, Some(Outcome::Ok));
+    assert_eq!(fake.entries(&["PULL"]), ["PULL_TOP", "PULL_FRONT", "PULL_RIGHT"]);
+    let top = record.faces.iter().find(|f| f.face.0 == "top").expect("worked on");
+    assert!(top.found.iter().all(|f| f.verdict == vision::Verdict::Review));
+    let bursts: Vec<usize> = top.attempts.iter().map(|a| a.bursts.len()).collect();
+    assert_eq!(bursts, [1, 1]);
+}
+
+#[test]
+fn of_the_picture_only_that_is_read_out_in_which_there_can_be_a_target() {
+    let fake = Fake::whole();
+    let record = run(&fake);
+    let (camera, camera_from_base) = (camera(), base_from_camera().inverse());
+    for face in &record.faces {
+        assert!(face.width_px < camera.width_px, "{face:?}");
+        for k in 0..8 {
+            let corner = volume().at([k & 1, k >> 1 & 1, k >> 2].map(f64::from));
+            let pixel = camera.project(camera_from_base * corner).expect("before the camera");
+            let shows = |at: f64, low: u32, size: u32, whole: u32| {
+                let at = at.clamp(0.0, f64::from(whole));
+                (f64::from(low)..=f64::from(low + size)).contains(&at)
+            };
+            assert!(shows(pixel.u_px, face.left_px, face.width_px, camera.width_px));
+            assert!(shows(pixel.v_px, face.top_px, face.height_px, camera.height_px));
+        }
+    }
 }
 
 #[test]
@@ -688,7 +735,7 @@ fn a_stuck_cover_s_screw_is_looked_for_first_where_a_head_was_in_doubt() {
     let doubt = |fake: &Fake, odds: f64, found: &mut Vec<vision::Screw>| {
         let on_the_left = fake.world().presented == "left";
         for screw in found.iter_mut().filter(|_| on_the_left && odds == 1.0) {
-            (screw.score, screw.fits, screw.verdict) = (0.4, 0.4, vision::Verdict::Review);
+            (screw.score, screw.fits, screw.verdict) = (0.25, 0.25, vision::Verdict::Review);
         }
     };
     let fake = Fake::new(&[
@@ -716,8 +763,9 @@ fn a_screw_that_is_seen_but_not_met_is_searched_for_around_its_place() {
     let record = run_altered(&fake, off);
     assert_eq!(record.outcome, Some(Outcome::Ok));
     assert_eq!((fake.standing(), record.screws_out()), (0, 1));
+    // at the place and where a second picture shows it; once more each when its cover has stayed, and then around it
     let drives = fake.calls("drive");
-    assert!((3..=8).contains(&drives), "{drives} bursts");
+    assert!((5..=10).contains(&drives), "{drives} bursts");
 }
 
 #[test]

@@ -279,14 +279,17 @@ fn figure(
     let hash = face.picture.as_ref().map_or("", |id| id.0.get(..8).unwrap_or(&id.0));
     let name = format!("unit{unit:03}-{index:02}-{}-{hash}.jpg", face.face);
     let shown = shrink(folder, face, &folder.join("report").join(&name))?;
-    let (w, h) = (face.width_px, face.height_px);
+    let (x, y, w, h) = (face.left_px, face.top_px, face.width_px, face.height_px);
     write!(
         page,
-        "<figure><svg viewBox=\"0 0 {w} {h}\" role=\"img\" aria-label=\"{} of unit {unit}\">",
+        "<figure><svg viewBox=\"{x} {y} {w} {h}\" role=\"img\" aria-label=\"{} of unit {unit}\">",
         escape(&face.face.0)
     )?;
     if shown {
-        write!(page, "<image href=\"report/{name}\" width=\"{w}\" height=\"{h}\"/>")?;
+        write!(
+            page,
+            "<image href=\"report/{name}\" x=\"{x}\" y=\"{y}\" width=\"{w}\" height=\"{h}\"/>"
+        )?;
     }
     for (k, found) in face.found.iter().enumerate() {
         write!(

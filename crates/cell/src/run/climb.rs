@@ -4,13 +4,10 @@ use super::{Stop, Way};
 use crate::capture::Shot;
 use crate::device::{DeviceError, DriveEnd, DriveProgram, Question, TagValue, tags};
 use crate::ladder::{Cause, Climb, Rung};
-use crate::look::LIKELY_ENOUGH;
+use crate::look;
 use crate::plan::{SafeTarget, Target};
 use crate::policy::{Case, Choice};
-use crate::record::{Event, FaceRecord, Purpose, Verdict};
-
-/// A head is searched around if it is a screw with so much probability.
-const WORTH_A_SEARCH: f64 = 0.9;
+use crate::record::{Event, Purpose, Verdict};
 
 /// Places on a ring, across the approach, mm.
 fn ring(places: u32, radius_mm: f64) -> impl Iterator<Item = [f64; 2]> {
@@ -42,6 +39,10 @@ impl Way<'_> {
                 break;
             }
             if matches!(rung, Rung::Search { .. }) && !self.is_worth_a_search(found) {
+                continue;
+            }
+            // What was looked at again and not met either is seldom a screw: its cover tells.
+            if matches!(rung, Rung::Search { .. } | Rung::Click) && cause == Cause::MissedHead && self.is_first_look() {
                 continue;
             }
             let end = match rung {
@@ -87,13 +88,16 @@ impl Way<'_> {
 
     /// True if a find of the face that is being worked on is a screw with enough probability, or by a person's word.
     pub(super) fn is_worth_a_search(&self, found: usize) -> bool {
-        let find = |face: &FaceRecord| face.found.get(found).map_or(0.0, |find| find.score);
-        self.record.faces.last().is_some_and(|face| match face.purpose {
-            Purpose::Clicked => true,
-            Purpose::Survey | Purpose::Work => find(face) >= WORTH_A_SEARCH,
-            Purpose::Missed => false,
-            Purpose::LastTry => find(face) >= LIKELY_ENOUGH,
+        self.record.faces.last().is_some_and(|face| {
+            let fits = face.found.get(found).map_or(0.0, |find| find.score);
+            look::is_worth_a_search(fits, face.purpose, &self.runner.config)
         })
+    }
+
+    /// True before anything is known of the covers that the face holds.
+    fn is_first_look(&self) -> bool {
+        let face = self.record.faces.last();
+        face.is_some_and(|face| matches!(face.purpose, Purpose::Survey | Purpose::Work))
     }
 
     /// Drives at places on a ring, until the bit meets something.

@@ -290,10 +290,15 @@ impl ColorCamera for Fake {
     async fn grab(&self, region: Option<Region>) -> Result<ColorFrame, DeviceError> {
         self.call("grab", 0.3);
         let mut world = self.world();
-        let what = if region.is_some() { "look" } else { "picture" };
+        let region = whole(region);
+        // a face, or what is around a few heads
+        let what = if 4 * region.width_px > camera().width_px {
+            "picture"
+        } else {
+            "look"
+        };
         let entry = format!("{what} {}", world.presented);
         world.log.push(entry);
-        let region = whole(region);
         let mut image = RgbImage::from_pixel(region.width_px, region.height_px, image::Rgb([120, 120, 118]));
         let tilt = world.tilt_rad.get(&world.presented).copied().unwrap_or(0.0);
         for head in world
