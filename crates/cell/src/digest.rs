@@ -88,7 +88,7 @@ impl Digest {
         let removed = attempts.iter().filter(|a| a.removed()).count();
         let out_at_once = attempts.iter().filter(|a| a.removed()).filter(first).count();
         let missed = record.faces.iter();
-        let missed = missed.filter(|f| matches!(f.purpose, Purpose::Missed | Purpose::LastTry));
+        let missed = missed.filter(|f| matches!(f.purpose, Purpose::Missed | Purpose::LastTry | Purpose::Search));
         Self {
             unit: record.unit,
             outcome: record.outcome.clone(),

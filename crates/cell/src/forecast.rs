@@ -294,7 +294,7 @@ impl Assumptions {
         let later = in_scope
             .iter()
             .flat_map(|r| &r.faces)
-            .filter(|f| matches!(f.purpose, Purpose::Missed | Purpose::LastTry))
+            .filter(|f| matches!(f.purpose, Purpose::Missed | Purpose::LastTry | Purpose::Search))
             .map(FaceRecord::removed)
             .sum::<usize>();
         self.screw.found = Chance::Counted {

@@ -28,8 +28,8 @@ const USUAL_HEAD_PX: f64 = 30.0;
 const USUAL_RIM_MM: f64 = 2.5;
 /// A head is searched around if its picture alone makes it a screw with so much probability;
 const WORTH_A_SEARCH: f64 = 0.9;
-/// in a last try with so much, the odds of that included: two in a hundred by its picture.
-const LIKELY_ENOUGH: f64 = 0.995;
+/// when nothing else is left, with so much.
+const LIKELY_ENOUGH: f64 = 0.02;
 /// Standard error of a click, px.
 const CLICK_PX: f64 = 1.5;
 
@@ -161,7 +161,7 @@ impl Judge<'_> {
         let mut screws = self.finder.find(&shot.frame, odds)?;
         // What the bit did not meet is not driven at again in the same place; what is likely enough is searched around, once.
         let is_left = |s: &vision::Screw| {
-            not_met(s).is_some_and(|searched| searched || !is_worth_a_search(s.fits, purpose, config))
+            not_met(s).is_some_and(|searched| searched || !is_worth_a_search(plan::without_odds(s.fits, odds), purpose))
         };
         for screw in screws.iter_mut().filter(|s| s.verdict == Verdict::Screw) {
             if is_left(screw) {
@@ -319,7 +319,7 @@ impl Judge<'_> {
 pub fn odds(config: &CellConfig, purpose: Purpose) -> f64 {
     match purpose {
         Purpose::Missed => config.inspection.stuck_cover_odds,
-        Purpose::LastTry => config.inspection.last_try_odds,
+        Purpose::LastTry | Purpose::Search => config.inspection.last_try_odds,
         Purpose::Survey | Purpose::Work | Purpose::Clicked => 1.0,
     }
 }
@@ -328,7 +328,7 @@ pub fn odds(config: &CellConfig, purpose: Purpose) -> f64 {
 /// hole would be a screw that still stands.
 pub fn odds_again(config: &CellConfig, purpose: Purpose) -> f64 {
     match purpose {
-        Purpose::Clicked | Purpose::LastTry => config.inspection.stuck_cover_odds,
+        Purpose::Clicked | Purpose::LastTry | Purpose::Search => config.inspection.stuck_cover_odds,
         other => odds(config, other),
     }
 }
@@ -336,14 +336,13 @@ pub fn odds_again(config: &CellConfig, purpose: Purpose) -> f64 {
 /// True if a head that the bit did not meet is to be searched around.
 ///
 /// # Arguments
-/// * `fits` – its probability with the odds of the purpose.
-pub fn is_worth_a_search(fits: f64, purpose: Purpose, config: &CellConfig) -> bool {
+/// * `alone` – its probability by the picture alone: [`plan::without_odds`].
+pub fn is_worth_a_search(alone: f64, purpose: Purpose) -> bool {
     match purpose {
         Purpose::Clicked => true,
-        Purpose::Survey | Purpose::Work | Purpose::Missed => {
-            plan::without_odds(fits, odds(config, purpose)) >= WORTH_A_SEARCH
-        }
-        Purpose::LastTry => fits >= LIKELY_ENOUGH,
+        Purpose::Survey | Purpose::Work | Purpose::Missed => alone >= WORTH_A_SEARCH,
+        Purpose::LastTry => false,
+        Purpose::Search => alone >= LIKELY_ENOUGH,
     }
 }
 

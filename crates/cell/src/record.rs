@@ -209,6 +209,8 @@ pub enum Purpose {
     Clicked,
     /// To try what is left, however unlikely, before a cover that still does not come off is given up.
     LastTry,
+    /// To search around what was not met, when nothing else is left.
+    Search,
 }
 
 /// One look at a face and what followed.

@@ -677,7 +677,7 @@ fn a_last_try_ends() {
 }
 
 #[test]
-fn in_a_last_try_a_likely_head_that_was_not_met_is_searched_around() {
+fn when_nothing_else_is_left_a_likely_head_that_was_not_met_is_searched_around() {
     // half behind a cable, the top's screw is in doubt and found 1.6 mm aside and 4 mm before its place
     let hidden = |fake: &Fake, odds: f64, found: &mut Vec<vision::Screw>| {
         let on_top = fake.world().presented == "top";
@@ -707,8 +707,11 @@ fn in_a_last_try_a_likely_head_that_was_not_met_is_searched_around() {
             .flat_map(|f| f.attempts.iter().map(|a| a.bursts.len()))
             .collect::<Vec<_>>()
     };
-    assert_eq!(tries(Purpose::Missed), [1]);
-    assert!(matches!(tries(Purpose::LastTry)[..], [tries] if tries > 2));
+    assert_eq!((tries(Purpose::Missed), tries(Purpose::LastTry)), (vec![1], vec![]));
+    assert!(matches!(tries(Purpose::Search)[..], [tries] if tries > 2));
+    // nowhere else is there a head to be searched around
+    let searched = record.faces.iter().filter(|f| f.purpose == Purpose::Search);
+    assert!(searched.into_iter().all(|f| f.face.0 == "top"));
 }
 
 #[test]

@@ -332,6 +332,7 @@ fn figure(
             Purpose::Missed => "looked again for missed screws".into(),
             Purpose::Clicked => "looked again with a person's clicks".into(),
             Purpose::LastTry => "looked again for whatever may still be a screw".into(),
+            Purpose::Search => "searched around heads that were not met".into(),
         },
         face.removed(),
         if retries > 0 {

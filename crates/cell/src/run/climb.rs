@@ -5,7 +5,7 @@ use crate::capture::Shot;
 use crate::device::{DeviceError, DriveEnd, DriveProgram, Question, TagValue, tags};
 use crate::ladder::{Cause, Climb, Rung};
 use crate::look;
-use crate::plan::{SafeTarget, Target};
+use crate::plan::{self, SafeTarget, Target};
 use crate::policy::{Case, Choice};
 use crate::record::{Event, Purpose, Verdict};
 
@@ -89,8 +89,9 @@ impl Way<'_> {
     /// True if a find of the face that is being worked on is a screw with enough probability, or by a person's word.
     pub(super) fn is_worth_a_search(&self, found: usize) -> bool {
         self.record.faces.last().is_some_and(|face| {
-            let fits = face.found.get(found).map_or(0.0, |find| find.score);
-            look::is_worth_a_search(fits, face.purpose, &self.runner.config)
+            let score = face.found.get(found).map_or(0.0, |find| find.score);
+            let alone = plan::without_odds(score, look::odds(&self.runner.config, face.purpose));
+            look::is_worth_a_search(alone, face.purpose)
         })
     }
 

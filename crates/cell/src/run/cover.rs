@@ -10,7 +10,7 @@ use crate::record::{
     Verdict,
 };
 
-/// Looks at a face at most to try what is left on it.
+/// Looks at a face at most to try what is left on it, and as many to search around it.
 const LAST_TRIES: usize = 3;
 
 /// What was tried at a screw that does not come out; more says more surely that there is one.
@@ -58,19 +58,30 @@ impl Way<'_> {
         // A screw that is known to stand holds the cover: looking for others would not free it. One that the bit has not met may be none, unless it was
         // searched around.
         let asked = self.may_ask().then_some(Purpose::Clicked);
-        for purpose in [Some(Purpose::Missed), asked, Some(Purpose::LastTry)]
-            .into_iter()
-            .flatten()
+        for purpose in [
+            Some(Purpose::Missed),
+            asked,
+            Some(Purpose::LastTry),
+            Some(Purpose::Search),
+        ]
+        .into_iter()
+        .flatten()
         {
-            let last = purpose == Purpose::LastTry;
+            let last = matches!(purpose, Purpose::LastTry | Purpose::Search);
             // the grip may have slipped: that is likelier than what is left, and a bounded pull may be tried a second time
-            if last && !pulled_again && self.pull(index, step).await? == PullEnd::Off {
-                return Ok(self.log(Event::Recovery { on: false })?);
+            if last && !pulled_again {
+                if self.pull(index, step).await? == PullEnd::Off {
+                    return Ok(self.log(Event::Recovery { on: false })?);
+                }
+                pulled_again = true;
             }
             if let Some(known) = self.known_standing(held_by, Tried::Around).filter(|_| last) {
                 return Err(Stop::Decided(known));
             }
             for (face, _) in &faces {
+                if purpose == Purpose::Search && !self.is_to_be_searched(face) {
+                    continue;
+                }
                 loop {
                     if let Some(known) = self.known_standing(held_by, Tried::Met) {
                         return Err(Stop::Decided(known));
@@ -84,7 +95,7 @@ impl Way<'_> {
                     }
                     // one that nobody saw is seldom alone
                     let looks = self.record.faces.iter().filter(|f| f.face == **face);
-                    if !last || looks.filter(|f| f.purpose == Purpose::LastTry).count() >= LAST_TRIES {
+                    if !last || looks.filter(|f| f.purpose == purpose).count() >= LAST_TRIES {
                         break;
                     }
                 }
@@ -114,6 +125,17 @@ impl Way<'_> {
             .filter(|(k, _)| left(k))
             .map(|(_, f)| f.score)
             .fold(0.0, f64::max)
+    }
+
+    /// True if the bit has not met a head on a face that is likely enough to be searched around, which nobody has done.
+    fn is_to_be_searched(&self, face: &FaceId) -> bool {
+        let looks = self.record.faces.iter().filter(|f| f.face == *face);
+        looks
+            .flat_map(|look| look.not_met().map(move |tried| (look, tried)))
+            .any(|(look, (find, attempt))| {
+                let alone = plan::without_odds(find.score, look::odds(&self.runner.config, look.purpose));
+                !attempt.searched() && look::is_worth_a_search(alone, Purpose::Search)
+            })
     }
 
     /// A screw on these faces that is known to stand, as the reason of a failure.

@@ -206,10 +206,10 @@ impl Way<'_> {
                 .collect();
             Box::pin(self.drive_out(&left, shot)).await?;
         }
-        // in a last try the cover is pulled at before anything is searched around
+        // when little is left the cover is pulled at before anything is searched around
         let pulls_first = |way: &Self| {
             let face = way.record.faces.last();
-            face.is_some_and(|face| face.purpose == Purpose::LastTry && face.removed() > 0)
+            face.is_some_and(|face| matches!(face.purpose, Purpose::LastTry | Purpose::Search) && face.removed() > 0)
         };
         for (target, tried) in targets.iter().zip(tried) {
             if pulls_first(self) && !self.is_met(target.found) {
