@@ -159,9 +159,16 @@ impl Judge<'_> {
         let is_anew = matches!(purpose, Purpose::Survey | Purpose::Work);
         let not_met = |s: &vision::Screw| earlier.not_met(s).filter(|_| !is_anew);
         let mut screws = self.finder.find(&shot.frame, odds)?;
-        // What the bit did not meet is not driven at again in the same place; what is likely enough is searched around, once.
+        // What the bit did not meet is not driven at again in the same place, unless it is likely enough to be searched around, which is done once; in a
+        // last try it has its chance where a new picture shows it, and afterwards nothing that was never tried is tried any more.
         let is_left = |s: &vision::Screw| {
-            not_met(s).is_some_and(|searched| searched || !is_worth_a_search(plan::without_odds(s.fits, odds), purpose))
+            let alone = plan::without_odds(s.fits, odds);
+            match (not_met(s), purpose) {
+                (Some(searched), Purpose::LastTry) => searched || !is_worth_a_search(alone, Purpose::Search),
+                (Some(searched), _) => searched || !is_worth_a_search(alone, purpose),
+                (None, Purpose::Search) => plan::is_doubtful(s.fits, odds),
+                (None, _) => false,
+            }
         };
         for screw in screws.iter_mut().filter(|s| s.verdict == Verdict::Screw) {
             if is_left(screw) {
