@@ -108,9 +108,6 @@ pub struct Inspection {
     pub second_look_mm: f64,
     /// A screw seen within this distance of a target is that target, mm.
     pub same_screw_mm: f64,
-    /// A head in doubt is driven at from this score on when its face is worked on: nobody is asked then, and a mark on what is no screw costs half of
-    /// what a cover that stays costs, as in the detector's own thresholds.
-    pub try_in_doubt_from: f64,
     /// How much likelier a doubtful head is a screw once the cover that it may hold has not come off: a missed screw always holds
     /// it, and of covers without one about one in 150 jams.
     pub stuck_cover_odds: f64,
@@ -132,7 +129,6 @@ impl Default for Inspection {
             same_screw_mm: 4.0,
             stuck_cover_odds: 150.0,
             last_try_odds: 10_000.0,
-            try_in_doubt_from: 0.34,
             doubtful_max: 6,
             vision_s_per_mpx: 0.02,
         }
@@ -452,8 +448,6 @@ impl CellConfig {
         for odds in [self.inspection.stuck_cover_odds, self.inspection.last_try_odds] {
             within("inspection.*_odds", odds, 1.0, 1e9, "1 to 1e9")?;
         }
-        let from = self.inspection.try_in_doubt_from;
-        within("inspection.try_in_doubt_from", from, 0.0, 1.0, "0 to 1, and 1 is never")?;
         let quality = f64::from(self.journal.jpeg_quality);
         within("journal.jpeg_quality", quality, 1.0, 100.0, "1 to 100")?;
         let times = &self.timeouts;

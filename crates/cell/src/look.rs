@@ -209,18 +209,7 @@ impl Judge<'_> {
             0..=2 => fit.with_heads(earlier.heads_normal()),
             _ => fit.with_heads(fit.look_together(tops.into_iter())),
         });
-        // Nobody is asked before a cover stays: what rather costs a pull than a mark is tried, and stays in doubt for the record.
-        let is_tried = |s: &vision::Screw| {
-            is_anew && s.verdict == Verdict::Review && s.fits >= config.inspection.try_in_doubt_from
-        };
-        let mut tried = screws.clone();
-        for screw in tried.iter_mut().filter(|s| is_tried(s)) {
-            screw.verdict = Verdict::Screw;
-        }
-        let (mut found, targets) = plan::plan(&tried, shot, fit.as_ref(), &self.reaches, config);
-        for (find, screw) in found.iter_mut().zip(&screws) {
-            find.verdict = screw.verdict;
-        }
+        let (mut found, targets) = plan::plan(&screws, shot, fit.as_ref(), &self.reaches, config);
         let seen_but_not_met = |s: &vision::Screw| {
             s.verdict == Verdict::Review && !plan::is_doubtful(s.fits, odds) && not_met(s) == Some(true)
         };

@@ -318,11 +318,6 @@ pub fn is_doubtful(fits: f64, odds: f64) -> bool {
     without_odds(fits, odds) < 0.5
 }
 
-/// The same of a find that was driven at or could have been.
-pub fn was_doubtful(find: &Found, odds: f64) -> bool {
-    find.verdict == Verdict::Review || is_doubtful(find.score, odds)
-}
-
 /// Leaves of the doubtful heads the `most` likely ones; the others are for a person to look at. One missed screw holds a cover: that is
 /// evidence for the best few, not for every crossing of a grille.
 ///

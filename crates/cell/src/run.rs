@@ -747,7 +747,7 @@ impl Way<'_> {
         // a person's click leaves no doubt
         let face = self.record.faces.last().filter(|f| f.purpose != Purpose::Clicked);
         face.and_then(|f| Some((f.found.get(found)?, look::odds(&self.runner.config, f.purpose))))
-            .is_some_and(|(find, odds)| plan::was_doubtful(find, odds))
+            .is_some_and(|(find, odds)| plan::is_doubtful(find.score, odds))
     }
 
     /// Lets the time pass that computing on a picture is budgeted with.

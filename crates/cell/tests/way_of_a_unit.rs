@@ -8,7 +8,7 @@ use cell::program::Program;
 use cell::record::{Act, ExclusionReason, LeftAlone, NgReason, Outcome, PullEnd, Purpose, SeenBy, UnitRecord};
 use cell::run::{RunError, Runner, Silent};
 use fake::{Fake, base_from_camera, camera, config, map, screw, screw_that_ends, volume};
-use geometry::{Pixel, Point};
+use geometry::Point;
 use nalgebra::Vector3;
 use std::path::Path;
 use std::sync::Arc;
@@ -455,8 +455,8 @@ fn a_stuck_cover_settles_the_doubt_about_a_head() {
     let doubt = |fake: &Fake, odds: f64, found: &mut Vec<vision::Screw>| {
         if fake.world().presented == "top" && odds == 1.0 {
             let right = found.iter_mut().max_by(|a, b| a.pixel.u_px.total_cmp(&b.pixel.u_px));
-            for head in right {
-                (head.score, head.fits, head.verdict) = (0.25, 0.25, vision::Verdict::Review);
+            if let Some(head) = right {
+                head.verdict = vision::Verdict::Review;
             }
         }
     };
@@ -471,33 +471,6 @@ fn a_stuck_cover_settles_the_doubt_about_a_head() {
         ["PULL_TOP", "PULL_TOP", "PULL_FRONT", "PULL_RIGHT"]
     );
     assert!(record.times.recovery_s > 5.0);
-}
-
-#[test]
-fn a_head_that_is_as_likely_a_screw_as_not_is_tried_at_once_and_stays_in_doubt_for_the_record() {
-    // of two heads in doubt on the top one is a screw; around the other one nothing is searched
-    let doubt = |fake: &Fake, _: f64, found: &mut Vec<vision::Screw>| {
-        if fake.world().presented == "top"
-            && let Some(mark) = found.first().cloned()
-        {
-            found.push(vision::Screw {
-                pixel: Pixel::new(mark.pixel.u_px + 40.0, mark.pixel.v_px),
-                camera: mark.camera.map(|p| Point::new(p.x_mm() + 60.0, p.y_mm(), p.z_mm())),
-                ..mark
-            });
-            for head in found {
-                (head.score, head.fits, head.verdict) = (0.45, 0.45, vision::Verdict::Review);
-            }
-        }
-    };
-    let fake = Fake::new(&[("front", vec![screw(0.0, 0.0)]), ("top", vec![screw(0.0, 0.0)])]);
-    let record = run_altered(&fake, doubt);
-    assert_eq!(record.outcome, Some(Outcome::Ok));
-    assert_eq!(fake.entries(&["PULL"]), ["PULL_TOP", "PULL_FRONT", "PULL_RIGHT"]);
-    let top = record.faces.iter().find(|f| f.face.0 == "top").expect("worked on");
-    assert!(top.found.iter().all(|f| f.verdict == vision::Verdict::Review));
-    let bursts: Vec<usize> = top.attempts.iter().map(|a| a.bursts.len()).collect();
-    assert_eq!(bursts, [1, 1]);
 }
 
 #[test]
@@ -738,7 +711,7 @@ fn a_stuck_cover_s_screw_is_looked_for_first_where_a_head_was_in_doubt() {
     let doubt = |fake: &Fake, odds: f64, found: &mut Vec<vision::Screw>| {
         let on_the_left = fake.world().presented == "left";
         for screw in found.iter_mut().filter(|_| on_the_left && odds == 1.0) {
-            (screw.score, screw.fits, screw.verdict) = (0.25, 0.25, vision::Verdict::Review);
+            (screw.score, screw.fits, screw.verdict) = (0.4, 0.4, vision::Verdict::Review);
         }
     };
     let fake = Fake::new(&[

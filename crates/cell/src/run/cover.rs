@@ -112,19 +112,10 @@ impl Way<'_> {
     /// The highest score of the heads that were left for a person when a face was worked on; 0 without any.
     fn doubt(&self, face: &FaceId) -> f64 {
         let worked_on = |f: &&FaceRecord| f.face == *face && f.purpose == Purpose::Work;
-        let Some(face) = self.record.faces.iter().rev().find(worked_on) else {
-            return 0.0;
-        };
-        let left = |number: &usize| face.attempts.iter().all(|a| a.found != *number || !a.removed());
-        let doubtful = face
-            .found
-            .iter()
-            .enumerate()
-            .filter(|(_, f)| f.verdict == Verdict::Review);
-        doubtful
-            .filter(|(k, _)| left(k))
-            .map(|(_, f)| f.score)
-            .fold(0.0, f64::max)
+        let worked_on = self.record.faces.iter().rev().find(worked_on);
+        let found = worked_on.into_iter().flat_map(|f| &f.found);
+        let doubtful = found.filter(|f| f.verdict == Verdict::Review);
+        doubtful.map(|f| f.score).fold(0.0, f64::max)
     }
 
     /// True if the bit has not met a head on a face that is likely enough to be searched around, which nobody has done.
@@ -150,7 +141,10 @@ impl Way<'_> {
             // what was tried for the cover's sake alone and not met is no screw
             let odds = look::odds(&self.runner.config, last.purpose);
             let is_none = |a: &&ScrewAttempt| {
-                let doubtful = last.found.get(a.found).is_some_and(|f| plan::was_doubtful(f, odds));
+                let doubtful = last
+                    .found
+                    .get(a.found)
+                    .is_some_and(|f| plan::is_doubtful(f.score, odds));
                 doubtful && !a.met()
             };
             let failed = last
@@ -188,7 +182,7 @@ impl Way<'_> {
             let screw = last
                 .found
                 .iter()
-                .find(|f| !plan::was_doubtful(f, odds) && f.left_alone.is_some_and(|why| barred.contains(&why)));
+                .find(|f| !plan::is_doubtful(f.score, odds) && f.left_alone.is_some_and(|why| barred.contains(&why)));
             if let Some((screw, why)) = screw.and_then(|f| Some((f, f.left_alone?))) {
                 let why = screw.refusal.clone().unwrap_or_else(|| why.to_string());
                 return Some(Outcome::Ng {
