@@ -87,8 +87,6 @@ impl Digest {
         let first = |a: &&&ScrewAttempt| a.bursts.first().and_then(|b| b.end) == Some(DriveEnd::Removed);
         let removed = attempts.iter().filter(|a| a.removed()).count();
         let out_at_once = attempts.iter().filter(|a| a.removed()).filter(first).count();
-        let missed = record.faces.iter();
-        let missed = missed.filter(|f| matches!(f.purpose, Purpose::Missed | Purpose::LastTry | Purpose::Search));
         Self {
             unit: record.unit,
             outcome: record.outcome.clone(),
@@ -101,7 +99,7 @@ impl Digest {
             out_at_once,
             out_later: removed - out_at_once,
             stayed: attempts.iter().filter(|a| !a.removed() && !a.absent()).count(),
-            found_later: missed.map(|f| f.removed()).sum(),
+            found_later: record.found_later(),
             retried: attempts.iter().filter(|a| a.retries() > 0).count(),
             scores_acted_on: scores(None),
             scores_in_doubt: scores(Some(LeftAlone::Review)),

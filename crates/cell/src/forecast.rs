@@ -5,7 +5,7 @@
 
 use crate::device::DriveEnd;
 use crate::digest::Digest;
-use crate::record::{FaceRecord, NgReason, Outcome, Purpose, UnitRecord};
+use crate::record::{NgReason, Outcome, UnitRecord};
 use rand::{RngExt, SeedableRng};
 use rand_distr::{Beta, Distribution, Poisson};
 use rand_pcg::Pcg64Mcg;
@@ -291,12 +291,7 @@ impl Assumptions {
             .map(|(why, hits)| (why, Chance::Counted { hits, of }))
             .collect();
         self.unit.screws_mean = screws as f64 / units;
-        let later = in_scope
-            .iter()
-            .flat_map(|r| &r.faces)
-            .filter(|f| matches!(f.purpose, Purpose::Missed | Purpose::LastTry | Purpose::Search))
-            .map(FaceRecord::removed)
-            .sum::<usize>();
+        let later: usize = in_scope.iter().map(|r| r.found_later()).sum();
         self.screw.found = Chance::Counted {
             hits: screws - later,
             of: screws + not_found,

@@ -18,8 +18,8 @@ pub enum Rung {
     },
     /// Look again with a region of the picture, map again, and drive there; ends the ladder if no screw is seen any more.
     LookAgain,
-    /// Drive at places around the last one, farther out than the bit's cone reaches, until the bit meets something. After a head that was missed
-    /// only once its cover has not come off.
+    /// Drive at places around the last one, farther out than the bit's cone reaches, until the bit meets something. What the bit has done nothing but
+    /// miss waits for it until its cover has not come off.
     Search {
         /// Places on the ring.
         places: u32,
@@ -29,7 +29,7 @@ pub enum Rung {
         #[serde(default)]
         deeper_mm: f64,
     },
-    /// Ask a person where in the picture the screw is, and drive there. Passed over where no person may be asked, and where a search would be.
+    /// Ask a person where in the picture the screw is, and drive there. Passed over where no person may be asked; waits like a search.
     Click,
 }
 

@@ -19,16 +19,16 @@ use serde::{Deserialize, Serialize};
 const COVER_OFF_MM: f64 = 15.0;
 
 /// Two places nearer than this share of a head's diameter are of one head: a click and a candidate, a find and one of an earlier look.
-const SAME_HEAD: f64 = 0.6;
+pub(crate) const SAME_HEAD: f64 = 0.6;
 /// Width that is taken for a head that only a person has seen, mm.
 const USUAL_HEAD_MM: f64 = 9.5;
 /// The same in a picture, px.
 const USUAL_HEAD_PX: f64 = 30.0;
 /// Height of its recess's rim above the sheet, mm.
 const USUAL_RIM_MM: f64 = 2.5;
-/// A head is searched around if its picture alone makes it a screw with so much probability;
+/// A head that the bit did not meet is searched around if its picture alone makes it a screw with so much probability.
 const WORTH_A_SEARCH: f64 = 0.9;
-/// when nothing else is left, with so much.
+/// The same when nothing else is left.
 const LIKELY_ENOUGH: f64 = 0.02;
 /// Standard error of a click, px.
 const CLICK_PX: f64 = 1.5;
@@ -159,12 +159,14 @@ impl Judge<'_> {
         let is_anew = matches!(purpose, Purpose::Survey | Purpose::Work);
         let not_met = |s: &vision::Screw| earlier.not_met(s).filter(|_| !is_anew);
         let mut screws = self.finder.find(&shot.frame, odds)?;
-        // What the bit did not meet is not driven at again in the same place, unless it is likely enough to be searched around, which is done once; in a
-        // last try it has its chance where a new picture shows it, and afterwards nothing that was never tried is tried any more.
+        // What the bit did not meet is not driven at again, unless it is to be searched around, which is done once, or this is the last try, in which
+        // what is likely enough has another chance by a new picture. A person's click brings back what it is on. When heads are searched around,
+        // no more are tried for the cover's sake alone.
         let is_left = |s: &vision::Screw| {
             let alone = plan::without_odds(s.fits, odds);
             match (not_met(s), purpose) {
-                (Some(searched), Purpose::LastTry) => searched || !is_worth_a_search(alone, Purpose::Search),
+                (Some(_), Purpose::Clicked) => true,
+                (Some(searched), Purpose::LastTry) => searched || alone < LIKELY_ENOUGH,
                 (Some(searched), _) => searched || !is_worth_a_search(alone, purpose),
                 (None, Purpose::Search) => plan::is_doubtful(s.fits, odds),
                 (None, _) => false,
@@ -197,6 +199,7 @@ impl Judge<'_> {
             odds,
             config.inspection.doubtful_max,
             earlier.by_pictures_alone(config),
+            |s| not_met(s).is_some(),
             fit.as_ref(),
             shot,
         );
@@ -329,10 +332,15 @@ pub fn odds_again(config: &CellConfig, purpose: Purpose) -> f64 {
     }
 }
 
+/// Probability that a find of a look is a screw, by its picture alone.
+pub fn by_picture_alone(find: &Found, purpose: Purpose, config: &CellConfig) -> f64 {
+    plan::without_odds(find.score, odds(config, purpose))
+}
+
 /// True if a head that the bit did not meet is to be searched around.
 ///
 /// # Arguments
-/// * `alone` – its probability by the picture alone: [`plan::without_odds`].
+/// * `alone` – its probability by the picture alone.
 pub fn is_worth_a_search(alone: f64, purpose: Purpose) -> bool {
     match purpose {
         Purpose::Clicked => true,

@@ -34,6 +34,11 @@ const SAME_LEAN_RAD: f64 = 0.07;
 /// normal, rad (8°).
 const HEADS_LEAN_FROM_RAD: f64 = 0.14;
 
+/// The sheet around a head is looked at so far from it, in its diameters.
+const AROUND_A_HEAD: f64 = 2.0;
+/// Doubtful heads that are screws are not met at the first burst in so many cases; assumed.
+const NOT_MET: f64 = 0.15;
+
 /// A place that an arm may be sent to: the point and the straight way to it lie in the calibrated volume of that arm's map, and
 /// the whole way there is free.
 ///
@@ -243,22 +248,25 @@ impl<'a> Reach<'a> {
     }
 }
 
-/// The part of the picture in which there can be a target: the calibrated volumes as the camera sees them, and a head's width more. `None` if that
-/// cannot be told, or the camera sees nothing of them.
+/// The part of the picture in which there can be a target: the calibrated volumes as the camera sees them, and as much more as is looked at around a
+/// head. `None` if that cannot be told, or the camera sees nothing of them.
 pub fn region_in_reach<'a>(
     camera: &CameraModel,
     maps: impl IntoIterator<Item = &'a Map>,
     head_mm: f64,
 ) -> Option<Region> {
-    let corners = maps.into_iter().flat_map(|map| {
+    // corners and middles: a lens bends the edges
+    let places = maps.into_iter().flat_map(|map| {
         let camera_from_base = map.base_from_camera().inverse();
-        (0..8).map(move |k| camera_from_base * map.volume().at([k & 1, k >> 1 & 1, k >> 2].map(f64::from)))
+        let share = |k: u32| f64::from(k % 3) / 2.0;
+        (0..27).map(move |k| camera_from_base * map.volume().at([share(k), share(k / 3), share(k / 9)]))
     });
-    let corners: Vec<Point<Camera>> = corners.collect();
-    let nearest_mm = corners.iter().map(Point::z_mm).reduce(f64::min)?;
+    let places: Vec<Point<Camera>> = places.collect();
+    let nearest_mm = places.iter().map(Point::z_mm).reduce(f64::min)?;
     // a volume that begins behind the camera may show anywhere
-    let pixels: Option<Vec<Pixel>> = corners.iter().map(|corner| camera.project(*corner)).collect();
-    region_of(camera, &pixels?, head_mm / camera.pixel_mm(nearest_mm).max(1e-6))
+    let pixels: Option<Vec<Pixel>> = places.iter().map(|place| camera.project(*place)).collect();
+    let around_px = AROUND_A_HEAD * head_mm / camera.pixel_mm(nearest_mm).max(1e-6);
+    region_of(camera, &pixels?, around_px)
 }
 
 /// Why an arm is not sent to a find.
@@ -324,12 +332,14 @@ pub fn is_doubtful(fits: f64, odds: f64) -> bool {
 /// # Arguments
 /// * `before` – finds of the same face when it was looked at without the odds: what was in doubt then and is now is likelier than
 ///   what one of two pictures shows.
+/// * `was_not_met` – whether the bit was driven at one before and met nothing, which makes it less likely a screw.
 /// * `face` – where the face lies: what is far from it, and not on a plate that looks the same way, is a gap of a grille.
 pub fn bound_doubtful(
     screws: &mut [vision::Screw],
     odds: f64,
     most: usize,
     before: &[Found],
+    was_not_met: impl Fn(&vision::Screw) -> bool,
     face: Option<&FaceFit>,
     shot: &Shot,
 ) {
@@ -353,9 +363,11 @@ pub fn bound_doubtful(
     let doubtful = screws
         .iter_mut()
         .filter(|s| s.verdict == Verdict::Screw && is_doubtful(s.fits, odds));
-    let mut doubtful: Vec<(f64, &mut vision::Screw)> = doubtful
-        .map(|s| (without_odds(s.fits, odds).max(seen_before(s)), s))
-        .collect();
+    let likelihood = |screw: &vision::Screw| {
+        let seen = without_odds(screw.fits, odds).max(seen_before(screw));
+        if was_not_met(screw) { NOT_MET * seen } else { seen }
+    };
+    let mut doubtful: Vec<(f64, &mut vision::Screw)> = doubtful.map(|s| (likelihood(s), s)).collect();
     doubtful.sort_by(|a, b| b.0.total_cmp(&a.0));
     let (likely, behind): (Vec<_>, Vec<_>) = doubtful.into_iter().partition(|(_, s)| on_face(s));
     for (_, screw) in likely.into_iter().skip(most).chain(behind) {

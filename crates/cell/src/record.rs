@@ -5,7 +5,7 @@
 
 use crate::device::{Bit, DriveEnd, DriveProgram};
 use crate::frames::KeptFrame;
-use crate::look::{Decision, SecondLook};
+use crate::look::{self, Decision, SecondLook};
 use crate::policy::Ruling;
 use crate::program::FaceId;
 use geometry::{Base, Camera, Direction, Point};
@@ -130,6 +130,9 @@ pub struct Burst {
     pub aim: Point<Base>,
     /// Picture of the second look that this burst was aimed with.
     pub second_look: Option<PictureId>,
+    /// Of a burst of a search: places around the head that were still to be tried after it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub places_left: Option<usize>,
     /// Time from the start of the approach to the end of the retreat, s.
     pub time_s: f64,
 }
@@ -180,9 +183,9 @@ impl ScrewAttempt {
             .iter()
             .any(|b| b.end.is_some_and(|end| end != DriveEnd::MissedHead))
     }
-    /// True if places around it were tried too.
+    /// True if every place on a ring around it was tried too.
     pub fn searched(&self) -> bool {
-        self.retries() > 2
+        self.bursts.iter().any(|b| b.places_left == Some(0))
     }
     /// True if its head was milled.
     pub fn milled(&self) -> bool {
@@ -244,6 +247,14 @@ pub struct FaceRecord {
     pub found: Vec<Found>,
     /// What was done, in the order in which it was done.
     pub attempts: Vec<ScrewAttempt>,
+}
+
+impl Found {
+    /// True if both finds are of one head, in pictures of one face.
+    pub fn is_of(&self, other: &Self) -> bool {
+        let off_px = (self.u_px - other.u_px).hypot(self.v_px - other.v_px);
+        off_px < look::SAME_HEAD * self.diameter_px
+    }
 }
 
 impl FaceRecord {
@@ -842,6 +853,32 @@ impl UnitRecord {
         self.faces.iter().map(FaceRecord::removed).sum()
     }
 
+    /// Screws that only came to light when their face was looked at again because a cover stayed: they are out, and nothing was tried at them before.
+    pub fn found_later(&self) -> usize {
+        let tried_before = |number: usize, face: &FaceRecord, found: &Found| {
+            let earlier = self.faces[..number].iter().filter(|f| f.face == face.face);
+            earlier
+                .flat_map(FaceRecord::not_met)
+                .any(|(unmet, _)| unmet.is_of(found))
+        };
+        let again = [Purpose::Missed, Purpose::LastTry, Purpose::Search];
+        let looks = self
+            .faces
+            .iter()
+            .enumerate()
+            .filter(|(_, f)| again.contains(&f.purpose));
+        let of_look = |(number, face): (usize, &FaceRecord)| {
+            let out = face.attempts.iter().filter(|a| a.removed());
+            out.filter(|a| {
+                face.found
+                    .get(a.found)
+                    .is_none_or(|found| !tried_before(number, face, found))
+            })
+            .count()
+        };
+        looks.map(of_look).sum()
+    }
+
     /// Attempts of the whole unit.
     pub fn attempts(&self) -> impl Iterator<Item = &ScrewAttempt> {
         self.faces.iter().flat_map(|f| &f.attempts)
@@ -866,6 +903,7 @@ mod tests {
             error: None,
             aim: Point::new(1.0, 2.0, 3.0),
             second_look: None,
+            places_left: None,
             time_s: 3.0,
         }
     }
@@ -886,6 +924,47 @@ mod tests {
             found: Vec::new(),
             attempts: Vec::new(),
         })
+    }
+
+    #[test]
+    fn what_was_tried_before_was_not_found_later() {
+        let found = |u_px: f64| Found {
+            u_px,
+            v_px: 10.0,
+            sigma_px: 0.2,
+            diameter_px: 20.0,
+            score: 0.9,
+            drive: "cross".into(),
+            verdict: Verdict::Screw,
+            camera_mm: None,
+            base_mm: None,
+            sigma_lateral_mm: None,
+            sigma_depth_mm: None,
+            hull: None,
+            tilt_rad: None,
+            left_alone: None,
+            refusal: None,
+        };
+        let attempt = |found: usize, end: DriveEnd| ScrewAttempt {
+            found,
+            arm: "arm_a".into(),
+            bursts: vec![burst(end)],
+            still_there: None,
+            decision: None,
+        };
+        let mut record = UnitRecord::new(1, 0.0);
+        record.faces.push(FaceRecord {
+            found: vec![found(100.0)],
+            attempts: vec![attempt(0, DriveEnd::MissedHead)],
+            ..*face()
+        });
+        record.faces.push(FaceRecord {
+            purpose: Purpose::Missed,
+            found: vec![found(103.0), found(300.0)],
+            attempts: vec![attempt(0, DriveEnd::Removed), attempt(1, DriveEnd::Removed)],
+            ..*face()
+        });
+        assert_eq!((record.screws_out(), record.found_later()), (2, 1));
     }
 
     fn seen() -> Event {

@@ -99,6 +99,7 @@ impl<'a> Mover<'a> {
             error: None,
             aim: target.tip(),
             second_look: None,
+            places_left: None,
             time_s: 0.0,
         };
         if let Err(error) = self.burst_into(target, program, &mut burst).await {

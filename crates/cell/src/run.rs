@@ -652,7 +652,11 @@ impl Way<'_> {
         let config = self.runner.config.clone();
         let devices = &self.runner.devices;
         let maps = self.reaches().into_iter().map(|reach| reach.map);
-        let region = plan::region_in_reach(&devices.color.intrinsics(), maps, config.inspection.head_mm[1]);
+        let region = match purpose {
+            // a screw beyond what an arm can reach is no target, but the reason why a cover stays
+            Purpose::LastTry => None,
+            _ => plan::region_in_reach(&devices.color.intrinsics(), maps, config.inspection.head_mm[1]),
+        };
         let shot = shoot(devices, region, config.inspection.depth_frames).await?;
         let clicks = if purpose == Purpose::Clicked {
             let text = format!("Which heads on the {face} are cross screws that still stand?");
@@ -776,6 +780,7 @@ impl Way<'_> {
         place: SafeTarget,
         program: DriveProgram,
         second_look: Option<PictureId>,
+        places_left: Option<usize>,
     ) -> Result<Option<DriveEnd>, Stop> {
         let target = Target {
             found,
@@ -787,7 +792,7 @@ impl Way<'_> {
             return Ok(None);
         };
         let mut burst = mover.burst(&place, program).await;
-        burst.second_look = second_look;
+        (burst.second_look, burst.places_left) = (second_look, places_left);
         let (end, failed) = (burst.end, burst.error.is_some());
         self.end_burst(&target, burst)?;
         if failed && self.is_in_trouble(&target).await {

@@ -272,6 +272,7 @@ fn an_event_that_was_altered_is_seen() {
             error: None,
             aim: geometry::Point::new(1.0, 2.0, 3.0),
             second_look: None,
+            places_left: None,
             time_s: 1.0,
         },
     };

@@ -149,6 +149,7 @@ mod tests {
                 error: None,
                 aim: Point::new(0.0, 0.0, 500.0),
                 second_look: None,
+                places_left: None,
                 time_s: 1.0,
             },
         }

@@ -5,7 +5,7 @@ use crate::capture::Shot;
 use crate::device::{DeviceError, DriveEnd, DriveProgram, Question, TagValue, tags};
 use crate::ladder::{Cause, Climb, Rung};
 use crate::look;
-use crate::plan::{self, SafeTarget, Target};
+use crate::plan::{SafeTarget, Target};
 use crate::policy::{Case, Choice};
 use crate::record::{Event, Purpose, Verdict};
 
@@ -35,14 +35,14 @@ impl Way<'_> {
         let mut not_met = false;
         while let Some(rung) = climb.next(cause, self.bursts(found)) {
             // What is tried for its cover's sake alone and is not met is none; what else may be none is looked at again, but not searched for.
-            if not_met && self.is_doubtful(found) && !self.is_worth_a_search(found) {
+            if not_met && self.is_doubtful(found) && !self.may_be_searched_around(found) {
                 break;
             }
-            if matches!(rung, Rung::Search { .. }) && !self.is_worth_a_search(found) {
+            if matches!(rung, Rung::Search { .. }) && !self.may_be_searched_around(found) {
                 continue;
             }
-            // What was looked at again and not met either is seldom a screw: its cover tells.
-            if matches!(rung, Rung::Search { .. } | Rung::Click) && cause == Cause::MissedHead && self.is_first_look() {
+            // What was not met where a second picture showed it either is seldom a screw: its cover tells.
+            if matches!(rung, Rung::Search { .. } | Rung::Click) && self.waits_for_its_cover(found) {
                 continue;
             }
             let end = match rung {
@@ -50,7 +50,7 @@ impl Way<'_> {
                     Some(end) => end,
                     None => break,
                 },
-                Rung::Drive { program } => self.burst(found, place, program, None).await?,
+                Rung::Drive { program } => self.burst(found, place, program, None, None).await?,
                 Rung::Search {
                     places,
                     radius_mm,
@@ -68,7 +68,7 @@ impl Way<'_> {
                         break;
                     };
                     place = again;
-                    self.burst(found, place, first, Some(picture)).await?
+                    self.burst(found, place, first, Some(picture), None).await?
                 }
             };
             not_met = end == Some(DriveEnd::MissedHead);
@@ -87,18 +87,25 @@ impl Way<'_> {
     }
 
     /// True if a find of the face that is being worked on is a screw with enough probability, or by a person's word.
-    pub(super) fn is_worth_a_search(&self, found: usize) -> bool {
+    pub(super) fn may_be_searched_around(&self, found: usize) -> bool {
         self.record.faces.last().is_some_and(|face| {
-            let score = face.found.get(found).map_or(0.0, |find| find.score);
-            let alone = plan::without_odds(score, look::odds(&self.runner.config, face.purpose));
+            let alone = |find| look::by_picture_alone(find, face.purpose, &self.runner.config);
+            let alone = face.found.get(found).map_or(0.0, alone);
             look::is_worth_a_search(alone, face.purpose)
         })
     }
 
-    /// True before anything is known of the covers that the face holds.
-    fn is_first_look(&self) -> bool {
-        let face = self.record.faces.last();
-        face.is_some_and(|face| matches!(face.purpose, Purpose::Survey | Purpose::Work))
+    /// True of a find that the bit has done nothing but miss, while its face is worked on and nothing is known of the covers that it holds.
+    fn waits_for_its_cover(&self, found: usize) -> bool {
+        self.record.faces.last().is_some_and(|face| {
+            let bursts = face
+                .attempts
+                .iter()
+                .filter(|a| a.found == found)
+                .flat_map(|a| &a.bursts);
+            let mut ends = bursts.map(|b| b.end);
+            face.purpose == Purpose::Work && ends.all(|end| end == Some(DriveEnd::MissedHead))
+        })
     }
 
     /// Drives at places on a ring, until the bit meets something.
@@ -110,14 +117,17 @@ impl Way<'_> {
         ring: impl Iterator<Item = [f64; 2]>,
         deeper_mm: f64,
     ) -> Result<Option<DriveEnd>, Stop> {
+        let map = self.runner.maps.get(place.arm());
+        let beside = |across_mm| map.and_then(|map| place.beside(map, across_mm, deeper_mm));
+        let bursts_left = self.runner.config.ladder.bursts_max.saturating_sub(self.bursts(found));
+        let mut places: Vec<SafeTarget> = ring.filter_map(beside).collect();
+        places.truncate(bursts_left);
         let mut end = Some(DriveEnd::MissedHead);
-        for across_mm in ring {
-            if end != Some(DriveEnd::MissedHead) || self.bursts(found) >= self.runner.config.ladder.bursts_max {
+        for (number, beside) in places.iter().enumerate() {
+            let left = places.len() - 1 - number;
+            end = self.burst(found, *beside, program, None, Some(left)).await?;
+            if end != Some(DriveEnd::MissedHead) {
                 break;
-            }
-            let map = self.runner.maps.get(place.arm());
-            if let Some(beside) = map.and_then(|map| place.beside(map, across_mm, deeper_mm)) {
-                end = self.burst(found, beside, program, None).await?;
             }
         }
         Ok(end)
@@ -155,7 +165,7 @@ impl Way<'_> {
         if choice != Choice::Mill {
             return Ok(None);
         }
-        Ok(Some(self.burst(found, place, program, None).await?))
+        Ok(Some(self.burst(found, place, program, None, None).await?))
     }
 
     /// Whether a person may be asked to click.

@@ -118,15 +118,18 @@ impl Way<'_> {
         doubtful.map(|f| f.score).fold(0.0, f64::max)
     }
 
-    /// True if the bit has not met a head on a face that is likely enough to be searched around, which nobody has done.
+    /// True if there is a head on a face that is likely enough to be searched around: the bit has not met it, and nothing has settled since what it is.
     fn is_to_be_searched(&self, face: &FaceId) -> bool {
-        let looks = self.record.faces.iter().filter(|f| f.face == *face);
-        looks
-            .flat_map(|look| look.not_met().map(move |tried| (look, tried)))
-            .any(|(look, (find, attempt))| {
-                let alone = plan::without_odds(find.score, look::odds(&self.runner.config, look.purpose));
-                !attempt.searched() && look::is_worth_a_search(alone, Purpose::Search)
+        let looks = || self.record.faces.iter().filter(|f| f.face == *face);
+        let attempts =
+            || looks().flat_map(|look| look.attempts.iter().filter_map(|a| Some((look.found.get(a.found)?, a))));
+        let is_settled = |find: &Found| attempts().any(|(other, a)| (a.removed() || a.searched()) && other.is_of(find));
+        looks().any(|look| {
+            look.not_met().any(|(find, attempt)| {
+                let alone = look::by_picture_alone(find, look.purpose, &self.runner.config);
+                look::is_worth_a_search(alone, Purpose::Search) && !attempt.absent() && !is_settled(find)
             })
+        })
     }
 
     /// A screw on these faces that is known to stand, as the reason of a failure.

@@ -153,7 +153,7 @@ impl Way<'_> {
             // what is tried for its cover's sake alone and is not met is no screw
             let not_driven = ended.program.is_none() || ended.end == Some(DriveEnd::MissedHead);
             self.end_burst(target, ended)?;
-            let is_none = not_driven && self.is_doubtful(target.found) && !self.is_worth_a_search(target.found);
+            let is_none = not_driven && self.is_doubtful(target.found) && !self.may_be_searched_around(target.found);
             if failed && self.is_in_trouble(target).await {
                 trouble = Some(screw);
             }
@@ -206,10 +206,11 @@ impl Way<'_> {
                 .collect();
             Box::pin(self.drive_out(&left, shot)).await?;
         }
-        // when little is left the cover is pulled at before anything is searched around
+        // when a missed screw has come out its cover is pulled at before anything is searched around
         let pulls_first = |way: &Self| {
+            let again = [Purpose::Missed, Purpose::LastTry, Purpose::Search];
             let face = way.record.faces.last();
-            face.is_some_and(|face| matches!(face.purpose, Purpose::LastTry | Purpose::Search) && face.removed() > 0)
+            face.is_some_and(|face| again.contains(&face.purpose) && face.removed() > 0)
         };
         for (target, tried) in targets.iter().zip(tried) {
             if pulls_first(self) && !self.is_met(target.found) {
