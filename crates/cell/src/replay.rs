@@ -270,7 +270,8 @@ impl<'a> UnitReplay<'a> {
         }?;
         match event {
             Event::Asked { clicks, .. } => self.clicks.clone_from(clicks),
-            Event::Seen { .. } | Event::Verified { .. } => self.clicks = None,
+            // a question that a crash cut short is asked again
+            Event::Seen { .. } | Event::Verified { .. } | Event::Resumed => self.clicks = None,
             _ => {}
         }
         if let Event::Seen { frame: Some(frame), .. } = event {
