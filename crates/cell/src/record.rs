@@ -169,9 +169,13 @@ impl ScrewAttempt {
         match self.end() {
             Some(DriveEnd::Removed) => self.still_there != Some(true),
             Some(DriveEnd::TimeOut) => self.still_there == Some(false),
-            Some(DriveEnd::MissedHead) => self.bursts.iter().any(|b| b.end == Some(DriveEnd::Removed)),
+            Some(DriveEnd::MissedHead) => self.claimed(),
             _ => false,
         }
+    }
+    /// True if the driver has said that it is out, whatever a picture says.
+    pub fn claimed(&self) -> bool {
+        self.bursts.iter().any(|b| b.end == Some(DriveEnd::Removed))
     }
     /// True if a second picture showed no screw where the bit had met nothing: there was none.
     pub fn absent(&self) -> bool {

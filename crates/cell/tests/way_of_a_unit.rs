@@ -725,6 +725,57 @@ fn a_search_that_a_crash_cut_short_is_made_again() {
 }
 
 #[test]
+fn where_a_search_meets_the_head_it_is_pressed_harder() {
+    let fake = Fake::new(&[("front", vec![screw_that_ends(10.0, 20.0, &[DriveEnd::CamOut])])]);
+    let folder = tempfile::tempdir().expect("folder");
+    let record = block_on(runner_that_is_off(&fake, folder.path(), 1.2).run_unit(&Silent)).expect("a record");
+    assert_eq!((&record.outcome, fake.standing()), (&Some(Outcome::Ok), 0));
+    let searched = record.attempts().find(|a| a.removed()).expect("out");
+    let ends: Vec<_> = searched.bursts.iter().rev().take(2).map(|b| b.end).collect();
+    assert_eq!(ends, [Some(DriveEnd::Removed), Some(DriveEnd::CamOut)]);
+}
+
+/// Finds on the front what stood there at first, but only once a cover has stayed.
+struct Hindsight(Fake);
+
+impl cell::run::Finder for Hindsight {
+    fn find(&self, frame: &geometry::RgbdFrame, odds: f64) -> Result<Vec<vision::Screw>, cell::device::DeviceError> {
+        if self.0.world().presented != "front" {
+            return self.0.find(frame, odds);
+        }
+        if odds == 1.0 {
+            return Ok(Vec::new());
+        }
+        let heads = self.0.world().faces["front"].clone();
+        for head in self.0.world().faces.get_mut("front").into_iter().flatten() {
+            head.stands = true;
+        }
+        let found = self.0.find(frame, odds);
+        self.0.world().faces.insert("front".into(), heads);
+        found
+    }
+    fn model(&self) -> String {
+        "hindsight".into()
+    }
+}
+
+#[test]
+fn where_driver_and_picture_contradict_each_other_the_cover_tells() {
+    let fake = Fake::new(&[
+        ("front", vec![screw_that_ends(0.0, 0.0, &[DriveEnd::MissedHead])]),
+        ("top", vec![screw(50.0, 0.0)]),
+    ]);
+    let folder = tempfile::tempdir().expect("folder");
+    let mut program = Program::paper().expect("built-in program");
+    program.steps[0].work = program.steps[1].work.clone(); // no screw need be seen on the front
+    let mut runner = runner_with(&fake, folder.path(), program, Hindsight(fake.clone()));
+    let record = block_on(runner.run_unit(&Silent)).expect("a record");
+    let attempt = record.attempts().find(|a| a.claimed() && a.still_there == Some(true));
+    assert!(attempt.is_some(), "the scene should contradict itself: {record:?}");
+    assert_eq!((record.outcome, fake.standing()), (Some(Outcome::Ok), 0));
+}
+
+#[test]
 fn what_the_bit_has_met_once_is_searched_around_at_once() {
     let ends = [
         DriveEnd::CamOut,

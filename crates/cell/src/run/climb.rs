@@ -57,7 +57,10 @@ impl Way<'_> {
                     deeper_mm,
                 } => {
                     let ring = ring(places, radius_mm);
-                    self.search(found, place, first, ring, deeper_mm).await?
+                    let (end, met_at) = self.search(found, place, first, ring, deeper_mm).await?;
+                    // what follows is done where the bit has met it
+                    place = met_at.unwrap_or(place);
+                    end
                 }
                 Rung::LookAgain | Rung::Click => {
                     let asks = rung == Rung::Click;
@@ -109,6 +112,9 @@ impl Way<'_> {
     }
 
     /// Drives at places on a ring, until the bit meets something.
+    ///
+    /// # Returns
+    /// How the last burst ended, and where the bit has met something.
     async fn search(
         &mut self,
         found: usize,
@@ -116,7 +122,7 @@ impl Way<'_> {
         program: DriveProgram,
         ring: impl Iterator<Item = [f64; 2]>,
         deeper_mm: f64,
-    ) -> Result<Option<DriveEnd>, Stop> {
+    ) -> Result<(Option<DriveEnd>, Option<SafeTarget>), Stop> {
         let map = self.runner.maps.get(place.arm());
         let beside = |across_mm| map.and_then(|map| place.beside(map, across_mm, deeper_mm));
         let bursts_left = self.runner.config.ladder.bursts_max.saturating_sub(self.bursts(found));
@@ -127,10 +133,10 @@ impl Way<'_> {
             let left = places.len() - 1 - number;
             end = self.burst(found, *beside, program, None, Some(left)).await?;
             if end != Some(DriveEnd::MissedHead) {
-                break;
+                return Ok((end, Some(*beside)));
             }
         }
-        Ok(end)
+        Ok((end, None))
     }
 
     /// Mills the head off if everything allows it; what was decided is in the journal either way.

@@ -86,7 +86,10 @@ impl Way<'_> {
                     if let Some(known) = self.known_standing(held_by, Tried::Met) {
                         return Err(Stop::Decided(known));
                     }
-                    if self.screws(index, step, face, purpose).await? == 0 {
+                    let out = self.screws(index, step, face, purpose).await?;
+                    // where driver and picture contradict each other the cover tells
+                    let mut attempts = self.record.faces.last().into_iter().flat_map(|f| &f.attempts);
+                    if out == 0 && !attempts.any(ScrewAttempt::claimed) {
                         break;
                     }
                     pulled_again = true;
