@@ -276,7 +276,7 @@ impl SimulatedCell {
     pub fn open(settings: SimSettings, log: &Path) -> Result<Self, LogError> {
         let (actions, file) = log::ActionLog::open(log)?;
         for action in &actions {
-            if let (Some(unit), ActionKind::Loaded { seed }) = (action.unit, &action.kind)
+            if let (Some(unit), ActionKind::Loaded { seed, .. }) = (action.unit, &action.kind)
                 && *seed != unit_seed(settings.units_seed, unit)
             {
                 return Err(LogError::OtherUnits {

@@ -23,6 +23,9 @@ pub enum ActionKind {
     Loaded {
         /// What it was drawn from.
         seed: u64,
+        /// Whether anything spoils it that the paper excluded units for: [`UnitScore::exclusion`]; not in logs of versions before.
+        #[serde(default)]
+        spoilt: Option<bool>,
     },
     /// A face came to stand before the camera.
     Presented {

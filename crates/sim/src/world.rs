@@ -397,7 +397,8 @@ impl World {
         match job {
             TableJob::Feed => {
                 let seed = self.load();
-                self.record(ActionKind::Loaded { seed });
+                let spoilt = self.unit.as_ref().map(|loaded| loaded.unit.exclusion.is_some());
+                self.record(ActionKind::Loaded { seed, spoilt });
             }
             TableJob::Turn(face) => {
                 if let Some(loaded) = &mut self.unit {

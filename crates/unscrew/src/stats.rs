@@ -4,11 +4,14 @@ use crate::Ended;
 use crate::audit::{Actions, audit};
 use anyhow::{Result, bail};
 use cell::{
+    digest::Digest,
     forecast::{Assumptions, Prediction, predictions},
     journal::Journal,
     statistics::{Rate, Shift, Statistics, by_shift},
 };
 use serde::Serialize;
+use sim::{Action, ActionKind};
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 /// Rates with Wilson bounds over units in scope and over all, times by resource, causes; from the journal. In simulation, also whether
@@ -38,6 +41,33 @@ fn shift_length(text: &str) -> Result<f64, String> {
     }
 }
 
+/// Units that nothing spoils of what the paper excluded units for, as the simulated world knows them: the nearest to the paper's units in scope.
+#[derive(Serialize)]
+struct Unspoilt {
+    /// OK of them.
+    ok_unspoilt: Rate,
+    /// Their mean cycle, s.
+    cycle_unspoilt_mean_s: Option<f64>,
+}
+
+impl Unspoilt {
+    /// `None` if the world's log does not say which they are.
+    fn of(units: &[Digest], world: &[Action]) -> Option<Self> {
+        // the journal counts units from 1, the world from 0
+        let known = world.iter().filter_map(|action| match action.kind {
+            ActionKind::Loaded { spoilt, .. } => Some((action.unit? + 1, spoilt?)),
+            _ => None,
+        });
+        let is_spoilt: BTreeMap<u64, bool> = known.collect();
+        let unspoilt = units.iter().filter(|u| is_spoilt.get(&u.unit) == Some(&false));
+        let statistics = Statistics::of(&unspoilt.cloned().collect::<Vec<_>>());
+        (!is_spoilt.is_empty()).then_some(Self {
+            ok_unspoilt: statistics.ok_of_all,
+            cycle_unspoilt_mean_s: statistics.cycle_mean_s,
+        })
+    }
+}
+
 /// What `--json` prints.
 #[derive(Serialize)]
 struct Printed {
@@ -45,6 +75,8 @@ struct Printed {
     statistics: Statistics,
     #[serde(flatten)]
     actions: Option<Actions>,
+    #[serde(flatten)]
+    unspoilt: Option<Unspoilt>,
     /// What its screws' scores and the units before it said of each unit in scope beforehand, beginning with the assumptions of `unscrew simulate`,
     /// and what became of it.
     predictions: Vec<Prediction>,
@@ -66,6 +98,7 @@ pub fn run(args: &Args) -> Result<Ended> {
         Err(_) => bail!("the simulated world's log could not be read to its end; report it"),
     };
     let statistics = Statistics::of(&units);
+    let unspoilt = actions.as_ref().and_then(|actions| Unspoilt::of(&units, actions));
     let actions = actions.map(|actions| audit(&units, &actions));
     let predictions = predictions(&Assumptions::default(), &units);
     let shifts = by_shift(&units, 3600.0 * args.shift_h);
@@ -73,6 +106,7 @@ pub fn run(args: &Args) -> Result<Ended> {
         let printed = Printed {
             statistics,
             actions,
+            unspoilt,
             predictions,
             shifts,
         };
@@ -102,6 +136,14 @@ pub fn run(args: &Args) -> Result<Ended> {
             predictions.iter().filter(|p| p.finished).count(),
             predictions.len(),
             predictions.iter().map(square).sum::<f64>() / n
+        );
+    }
+    if let Some(unspoilt) = unspoilt {
+        let cycle_s = unspoilt.cycle_unspoilt_mean_s;
+        println!(
+            "unspoilt   {} of units without what the paper excludes, by the world's own log; mean cycle {}",
+            percent(&unspoilt.ok_unspoilt),
+            cycle_s.map_or("-".into(), |s| format!("{s:.1} s")),
         );
     }
     if let Some(a) = actions {
@@ -155,4 +197,42 @@ pub fn text(s: &Statistics) -> String {
         text.push_str(&format!("  {count:3} x {}\n", cause.replace('_', " ")));
     }
     text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use cell::record::{Event, NgReason, Outcome, UnitRecord};
+
+    #[test]
+    fn what_the_world_has_spoilt_is_not_counted_as_the_paper_did_not() {
+        let digest = |unit: u64, is_ok: bool| {
+            let outcome = match is_ok {
+                true => Outcome::Ok,
+                false => Outcome::Ng {
+                    reason: NgReason::ScrewSeized,
+                    detail: String::new(),
+                },
+            };
+            let mut record = UnitRecord::new(unit, 0.0);
+            record.apply(100.0, &Event::Decided { outcome });
+            record.apply(110.0, &Event::Discharged);
+            Digest::of(&record)
+        };
+        let units = [digest(1, true), digest(2, false), digest(3, false), digest(4, true)];
+        let loaded = |unit: u64, spoilt: Option<bool>| Action {
+            t_s: 0.0,
+            unit: Some(unit),
+            kind: ActionKind::Loaded { seed: unit, spoilt },
+        };
+        let world = [
+            loaded(0, Some(false)),
+            loaded(1, Some(true)),
+            loaded(2, Some(false)),
+            loaded(3, None),
+        ];
+        let rate = Unspoilt::of(&units, &world).expect("known").ok_unspoilt;
+        assert_eq!((rate.hits, rate.of), (1, 2));
+        assert!(Unspoilt::of(&units, &[loaded(0, None)]).is_none(), "a log of before");
+    }
 }

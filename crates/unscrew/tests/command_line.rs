@@ -303,6 +303,9 @@ fn a_unit_from_end_to_end() {
     let mut count = |name: &str| counted.remove(name).and_then(|n| n.as_u64());
     assert!(count("actions_total") >= removed["hits"].as_u64());
     assert_eq!((count("actions_repeated"), count("actions_lost")), (Some(0), Some(0)));
+    let unspoilt = stats.as_object_mut().and_then(|s| s.remove("ok_unspoilt"));
+    assert!(unspoilt.is_some_and(|rate| rate["of"].as_u64() <= Some(1)));
+    stats.as_object_mut().and_then(|s| s.remove("cycle_unspoilt_mean_s"));
     let predictions = stats.as_object_mut().and_then(|s| s.remove("predictions"));
     let predicted = predictions.as_ref().and_then(|p| p[0]["predicted"].as_f64());
     assert!(predicted.is_some_and(|p| (0.0..1.0).contains(&p)), "{predictions:?}");
