@@ -735,6 +735,34 @@ fn where_a_search_meets_the_head_it_is_pressed_harder() {
     assert_eq!(ends, [Some(DriveEnd::Removed), Some(DriveEnd::CamOut)]);
 }
 
+#[test]
+fn what_the_bit_has_met_is_searched_around_whatever_its_picture_says() {
+    // of the top's screw nine pictures in ten say that it is none; the bit slips out of it and does not meet it again
+    let doubt = |fake: &Fake, odds: f64, found: &mut Vec<vision::Screw>| {
+        let on_top = fake.world().presented == "top";
+        for screw in found.iter_mut().filter(|_| on_top) {
+            screw.fits = odds * 0.1 / (odds * 0.1 + 0.9);
+            screw.score = screw.fits;
+            if screw.fits < 0.6 {
+                screw.verdict = vision::Verdict::Review;
+            }
+        }
+    };
+    let slips = [DriveEnd::CamOut; 3].into_iter().chain([DriveEnd::MissedHead; 9]);
+    let ends: Vec<DriveEnd> = slips.collect();
+    let fake = Fake::new(&[
+        ("front", vec![screw(0.0, 0.0)]),
+        ("top", vec![screw_that_ends(90.0, 0.0, &ends)]),
+    ]);
+    let record = run_altered(&fake, doubt);
+    let top = record
+        .faces
+        .iter()
+        .find(|f| f.purpose == Purpose::Missed && f.face.0 == "top");
+    let attempts = top.map(|f| f.attempts.as_slice()).unwrap_or_default();
+    assert!(attempts.iter().any(|a| a.met() && a.searched()), "{attempts:?}");
+}
+
 /// Finds on the front what stood there at first, but only once a cover has stayed.
 struct Hindsight(Fake);
 

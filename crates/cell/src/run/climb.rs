@@ -7,7 +7,7 @@ use crate::ladder::{Cause, Climb, Rung};
 use crate::look;
 use crate::plan::{SafeTarget, Target};
 use crate::policy::{Case, Choice};
-use crate::record::{Event, Purpose, Verdict};
+use crate::record::{Event, FaceRecord, Purpose, Verdict};
 
 /// Places on a ring, across the approach, mm.
 fn ring(places: u32, radius_mm: f64) -> impl Iterator<Item = [f64; 2]> {
@@ -89,13 +89,14 @@ impl Way<'_> {
         attempts.filter(|a| a.found == found).map(|a| a.bursts.len()).sum()
     }
 
-    /// True if a find of the face that is being worked on is a screw with enough probability, or by a person's word.
+    /// True if a find of the face that is being worked on is a screw with enough probability, by a person's word, or because the bit has met it.
     pub(super) fn may_be_searched_around(&self, found: usize) -> bool {
-        self.record.faces.last().is_some_and(|face| {
+        let seen = |face: &FaceRecord| {
             let alone = |find| look::by_picture_alone(find, face.purpose, &self.runner.config);
             let alone = face.found.get(found).map_or(0.0, alone);
             look::is_worth_a_search(alone, face.purpose)
-        })
+        };
+        self.is_met(found) || self.record.faces.last().is_some_and(seen)
     }
 
     /// True of a find that the bit has done nothing but miss, while its face is worked on and nothing is known of the covers that it holds.
