@@ -516,23 +516,6 @@ mod tests {
     /// What is known of a face that has been worked on: the holes of its flanges.
     fn worked_on(face: &FaceId) -> UnitRecord {
         let mut record = UnitRecord::new(1, 0.0);
-        let hole = |u_px: f64, v_px: f64| Found {
-            u_px,
-            v_px,
-            sigma_px: 0.2,
-            diameter_px: 20.0,
-            score: 0.99,
-            drive: "cross".into(),
-            verdict: Verdict::Screw,
-            camera_mm: None,
-            base_mm: None,
-            sigma_lateral_mm: None,
-            sigma_depth_mm: None,
-            hull: None,
-            tilt_rad: None,
-            left_alone: None,
-            refusal: None,
-        };
         record.faces.push(FaceRecord {
             step: 4,
             step_name: "front inner screws".into(),
@@ -546,7 +529,7 @@ mod tests {
             height_px: 600,
             plane: None,
             found: [(160.0, 100.0), (400.0, 98.0), (150.0, 300.0), (160.0, 500.0)]
-                .map(|(u, v)| hole(u, v))
+                .map(|(u_px, v_px)| Found::screw_at(u_px, v_px))
                 .to_vec(),
             attempts: Vec::new(),
         });

@@ -897,6 +897,30 @@ impl UnitRecord {
 }
 
 #[cfg(test)]
+impl Found {
+    /// A screw that was seen well, of which nothing is known but its pixel.
+    pub(crate) fn screw_at(u_px: f64, v_px: f64) -> Self {
+        Self {
+            u_px,
+            v_px,
+            sigma_px: 0.2,
+            diameter_px: 20.0,
+            score: 0.99,
+            drive: "cross".into(),
+            verdict: Verdict::Screw,
+            camera_mm: None,
+            base_mm: None,
+            sigma_lateral_mm: None,
+            sigma_depth_mm: None,
+            hull: None,
+            tilt_rad: None,
+            left_alone: None,
+            refusal: None,
+        }
+    }
+}
+
+#[cfg(test)]
 mod tests {
     use super::*;
 
@@ -932,23 +956,7 @@ mod tests {
 
     #[test]
     fn what_was_tried_before_was_not_found_later() {
-        let found = |u_px: f64| Found {
-            u_px,
-            v_px: 10.0,
-            sigma_px: 0.2,
-            diameter_px: 20.0,
-            score: 0.9,
-            drive: "cross".into(),
-            verdict: Verdict::Screw,
-            camera_mm: None,
-            base_mm: None,
-            sigma_lateral_mm: None,
-            sigma_depth_mm: None,
-            hull: None,
-            tilt_rad: None,
-            left_alone: None,
-            refusal: None,
-        };
+        let found = |u_px: f64| Found::screw_at(u_px, 10.0);
         let attempt = |found: usize, end: DriveEnd| ScrewAttempt {
             found,
             arm: "arm_a".into(),

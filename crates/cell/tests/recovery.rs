@@ -10,7 +10,7 @@ use cell::policy::{Choice, Destructive, Target};
 use cell::program::Program;
 use cell::record::{Assist, Method, NgReason, Outcome, Purpose, UnitRecord};
 use cell::run::{RunError, Runner, Silent};
-use fake::{Fake, map, screw, screw_that_ends};
+use fake::{Fake, map, screw, screw_that_ends, started};
 use std::path::Path;
 use std::sync::Arc;
 
@@ -164,16 +164,7 @@ fn a_person_shows_where_a_screw_is_that_the_bit_does_not_meet() {
         let folder = tempfile::tempdir().expect("folder");
         let mut config = fake::config();
         config.help.click = click;
-        let mut runner = Runner::new(
-            fake.devices(),
-            Arc::new(Aside(fake.clone(), 2.2)),
-            vec![map()],
-            Program::paper().expect("built-in program"),
-            config,
-            Journal::open(folder.path()).expect("journal"),
-        )
-        .expect("runner");
-        runner.start().expect("started");
+        let mut runner = started(fake, folder.path(), Aside(fake.clone(), 2.2), map(), config);
         block_on(runner.run_unit(&Silent)).expect("a record")
     };
     let alone = run(&unmet(), false);

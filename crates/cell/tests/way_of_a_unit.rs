@@ -7,37 +7,34 @@ use cell::journal::Journal;
 use cell::program::Program;
 use cell::record::{Act, ExclusionReason, LeftAlone, NgReason, Outcome, PullEnd, Purpose, SeenBy, UnitRecord};
 use cell::run::{RunError, Runner, Silent};
-use fake::{Fake, base_from_camera, camera, config, map, map_that_is_off, screw, screw_that_ends, volume};
+use fake::{Fake, base_from_camera, camera, config, map, map_that_is_off, screw, screw_that_ends, started, volume};
 use geometry::Point;
 use nalgebra::Vector3;
 use std::path::Path;
 use std::sync::Arc;
 
 fn runner(fake: &Fake, folder: &Path) -> Runner {
-    runner_with(fake, folder, Program::paper().expect("built-in program"), fake.clone())
+    started(fake, folder, fake.clone(), map(), config())
 }
 
 fn runner_with(fake: &Fake, folder: &Path, program: Program, finder: impl cell::run::Finder + 'static) -> Runner {
-    started(fake, folder, program, finder, map())
+    let journal = Journal::open(folder).expect("journal");
+    let runner = Runner::new(
+        fake.devices(),
+        Arc::new(finder),
+        vec![map()],
+        program,
+        config(),
+        journal,
+    )
+    .expect("runner");
+    runner.start().expect("started");
+    runner
 }
 
 /// A runner whose arm goes so far too high.
 fn runner_that_is_off(fake: &Fake, folder: &Path, by_mm: f64) -> Runner {
-    let program = Program::paper().expect("built-in program");
-    started(fake, folder, program, fake.clone(), map_that_is_off(by_mm))
-}
-
-fn started(
-    fake: &Fake,
-    folder: &Path,
-    program: Program,
-    finder: impl cell::run::Finder + 'static,
-    map: calibration::Map,
-) -> Runner {
-    let journal = Journal::open(folder).expect("journal");
-    let runner = Runner::new(fake.devices(), Arc::new(finder), vec![map], program, config(), journal).expect("runner");
-    runner.start().expect("started");
-    runner
+    started(fake, folder, fake.clone(), map_that_is_off(by_mm), config())
 }
 
 /// What the fake finds, with something done to it: the function is told the world and the odds.
@@ -67,8 +64,7 @@ fn run(fake: &Fake) -> UnitRecord {
 /// A run whose finder tells what the fake finds with something done to it.
 fn run_altered(fake: &Fake, alter: impl Fn(&Fake, f64, &mut Vec<vision::Screw>) + Send + Sync + 'static) -> UnitRecord {
     let folder = tempfile::tempdir().expect("folder");
-    let program = Program::paper().expect("built-in program");
-    let mut runner = runner_with(fake, folder.path(), program, Altered(fake.clone(), alter));
+    let mut runner = started(fake, folder.path(), Altered(fake.clone(), alter), map(), config());
     block_on(runner.run_unit(&Silent)).expect("a record")
 }
 
@@ -848,16 +844,7 @@ fn what_is_no_screw_is_driven_at_once_more_in_a_last_try_and_never_for_a_person_
     let folder = tempfile::tempdir().expect("folder");
     let mut config = config();
     config.help.click = true;
-    let mut runner = Runner::new(
-        fake.devices(),
-        Arc::new(Altered(fake.clone(), mark)),
-        vec![map()],
-        Program::paper().expect("built-in program"),
-        config,
-        Journal::open(folder.path()).expect("journal"),
-    )
-    .expect("runner");
-    runner.start().expect("started");
+    let mut runner = started(&fake, folder.path(), Altered(fake.clone(), mark), map(), config);
     let record = block_on(runner.run_unit(&Silent)).expect("a record");
     assert!(matches!(record.outcome, Some(Outcome::Ng { .. })));
     let top = record.faces.iter().filter(|f| f.face.0 == "top");

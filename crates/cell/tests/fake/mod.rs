@@ -5,10 +5,13 @@
 use async_trait::async_trait;
 use calibration::{Map, Pair, Settings, Volume, lattice};
 use cell::device::*;
-use cell::run::Finder;
+use cell::journal::Journal;
+use cell::program::Program;
+use cell::run::{Finder, Runner};
 use geometry::{Base, Camera, CameraModel, DepthMap, Direction, Pixel, Point, RgbImage, RgbdFrame, Tool, Transform};
 use nalgebra::{Matrix3, Rotation3, UnitQuaternion, Vector3};
 use std::collections::{BTreeMap, VecDeque};
+use std::path::Path;
 use std::sync::{Arc, Mutex, MutexGuard};
 
 pub const FACES: [&str; 5] = ["front", "left", "right", "top", "front_inner"];
@@ -201,6 +204,21 @@ pub fn config() -> cell::CellConfig {
     let mut config = cell::CellConfig::simulated();
     config.motion.arms[0].home_rad = rest_rad();
     config
+}
+
+/// A runner of the paper's program that has been started.
+pub fn started(
+    fake: &Fake,
+    folder: &Path,
+    finder: impl Finder + 'static,
+    map: Map,
+    config: cell::CellConfig,
+) -> Runner {
+    let program = Program::paper().expect("built-in program");
+    let journal = Journal::open(folder).expect("journal");
+    let runner = Runner::new(fake.devices(), Arc::new(finder), vec![map], program, config, journal).expect("runner");
+    runner.start().expect("started");
+    runner
 }
 
 pub fn camera() -> CameraModel {
