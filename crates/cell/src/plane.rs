@@ -91,7 +91,7 @@ impl FaceFit {
             let plane = sheet_plane(frame, pixel, diameter_px)?;
             Some(Sheet {
                 at: camera.unproject(pixel, plane.depth_mm).vector(),
-                normal: plane_normal(&camera, pixel, &plane)?.vector(),
+                normal: plane.normal(&camera, pixel)?.vector(),
             })
         };
         let sheets: Vec<Sheet> = heads.iter().filter_map(sheet).collect();
@@ -270,7 +270,7 @@ fn median(values: impl Iterator<Item = f64>) -> f64 {
 
 /// Normal of the sheet around a head, towards the camera; `None` without enough depth there.
 pub fn sheet_normal(frame: &RgbdFrame, pixel: Pixel, diameter_px: f64) -> Option<Direction<Camera>> {
-    plane_normal(&frame.camera?, pixel, &sheet_plane(frame, pixel, diameter_px)?)
+    sheet_plane(frame, pixel, diameter_px)?.normal(&frame.camera?, pixel)
 }
 
 /// Depth of the sheet around a head, at its centre, mm; `None` without enough depth there.
@@ -284,17 +284,6 @@ fn sheet_plane(frame: &RgbdFrame, pixel: Pixel, diameter_px: f64) -> Option<Surf
         .as_ref()?
         .plane_at(pixel, 0.8 * diameter_px, 2.0 * diameter_px)?;
     (plane.inliers >= 40).then_some(plane)
-}
-
-fn plane_normal(camera: &CameraModel, pixel: Pixel, plane: &SurfaceSample) -> Option<Direction<Camera>> {
-    let at = |du: f64, dv: f64| {
-        let z = plane.depth_mm + plane.slope_mm_per_px[0] * du + plane.slope_mm_per_px[1] * dv;
-        let pixel = Pixel::new(pixel.u_px + du, pixel.v_px + dv);
-        camera.unproject(pixel, z).vector()
-    };
-    let middle = at(0.0, 0.0);
-    let normal = (at(4.0, 0.0) - middle).cross(&(at(0.0, 4.0) - middle));
-    Direction::from_vector(if normal.z > 0.0 { -normal } else { normal })
 }
 
 #[cfg(test)]

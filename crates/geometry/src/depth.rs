@@ -1,6 +1,6 @@
 //! Registered depth and how to read it at a sub-pixel point in spite of holes and edges.
 
-use crate::{CameraModel, Pixel};
+use crate::{Camera, CameraModel, Direction, Pixel, Point};
 
 /// z along the optical axis for every `step` x `step` block of colour pixels; 0 is "no measurement".
 #[derive(Clone, Debug, PartialEq)]
@@ -26,6 +26,28 @@ pub struct SurfaceSample {
     pub slope_mm_per_px: [f64; 2],
     /// Measurements that agree with the plane.
     pub inliers: usize,
+}
+
+impl SurfaceSample {
+    /// Depth of the plane so many pixels from where it was fitted, mm.
+    pub fn depth_at_mm(&self, [du, dv]: [f64; 2]) -> f64 {
+        let [along_u, along_v] = self.slope_mm_per_px;
+        self.depth_mm + along_u * du + along_v * dv
+    }
+
+    /// Normal of the plane, against the viewing ray.
+    ///
+    /// # Arguments
+    /// * `pixel` – where it was fitted.
+    pub fn normal(&self, camera: &CameraModel, pixel: Pixel) -> Option<Direction<Camera>> {
+        let at = |du: f64, dv: f64| {
+            let pixel = Pixel::new(pixel.u_px + du, pixel.v_px + dv);
+            camera.unproject(pixel, self.depth_at_mm([du, dv])).vector()
+        };
+        let middle = at(0.0, 0.0);
+        let normal = (at(4.0, 0.0) - middle).cross(&(at(0.0, 4.0) - middle));
+        Direction::from_vector(if normal.dot(&middle) > 0.0 { -normal } else { normal })
+    }
 }
 
 impl DepthMap {
@@ -185,7 +207,7 @@ impl DepthMap {
         pixel: Pixel,
         inner_px: f64,
         outer_px: f64,
-    ) -> Option<(crate::Point<crate::Camera>, SurfaceSample)> {
+    ) -> Option<(Point<Camera>, SurfaceSample)> {
         let sample = self.plane_at(pixel, inner_px, outer_px)?;
         Some((camera.unproject(pixel, sample.depth_mm), sample))
     }
