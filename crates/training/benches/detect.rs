@@ -76,7 +76,9 @@ fn stage_2(bencher: Bencher<'_, '_>, cores: usize) {
         .iter()
         .map(|c| c.pixel)
         .collect();
-    bencher.bench(on(cores, || look(&model.fine, &FACE.frame.color, &places)));
+    bencher.bench(on(cores, || {
+        look(&model.fine, model.close.as_ref(), &FACE.frame.color, &places)
+    }));
 }
 
 #[divan::bench(sample_count = 10)]

@@ -6,9 +6,9 @@
 use std::path::{Path, PathBuf};
 use training::{TUNING_SEEDS, TrainSettings, Trial, measure_networks, measure_networks_on_pictures};
 
-fn say(name: &str, networks: usize, t: &Trial) {
+fn say(name: &str, looks: &str, t: &Trial) {
     println!(
-        "{name:9} {networks} networks: recall {:.4}  log loss {:.4}  drive {:.3}  centre {:.3} {:.3} px  ({} screws, {} others)",
+        "{name:9} {looks:14} recall {:.4}  log loss {:.4}  drive {:.3}  centre {:.3} {:.3} px  ({} screws, {} others)",
         t.recall, t.log_loss, t.drive_right, t.center_px[0], t.center_px[1], t.screws, t.others
     );
 }
@@ -24,18 +24,23 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         ..TrainSettings::default()
     };
     let unseen = TUNING_SEEDS.start + 100_000;
-    let mut counts = vec![1, model.fine.len()];
-    counts.dedup();
-    for count in counts {
-        let networks = &model.fine[..count];
+    let mut looks = vec![("one network", &model.fine[..1], None)];
+    looks.extend((model.fine.len() > 1).then_some(("all networks", &model.fine[..], None)));
+    looks.extend(
+        model
+            .close
+            .as_ref()
+            .map(|close| ("a closer look", &model.fine[..], Some(close))),
+    );
+    for (looks, fine, close) in looks {
         for (name, units) in [("seen", 0..40), ("unseen", unseen..unseen + 40)] {
-            say(name, count, &measure_networks(networks, units, &settings)?);
+            say(name, looks, &measure_networks(fine, close, units, &settings)?);
         }
         for folder in pictures {
             say(
                 "pictures",
-                count,
-                &measure_networks_on_pictures(networks, Path::new(folder))?,
+                looks,
+                &measure_networks_on_pictures(fine, close, Path::new(folder))?,
             );
         }
     }

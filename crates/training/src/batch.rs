@@ -9,8 +9,9 @@ use rand_pcg::Pcg64Mcg;
 use rayon::prelude::*;
 use vision::Clip;
 use vision::layout::{
-    CLASS_CHANNELS, CLASSES, CLIP_CENTER_PX, CLIP_PX, Class, FINE_INPUT_CHANNELS, IGNORE_RADIUS, LABEL_RADIUS,
-    LN_DIAMETER, NOMINAL_HEAD_PX, OFFSET_U, OFFSET_UNIT_PX, OFFSET_V, STRIDE, cell_center_px, network_value,
+    CLASS_CHANNELS, CLASSES, CLIP_CENTER_PX, CLIP_PX, CLOSE_HEAD_PX, Class, FINE_INPUT_CHANNELS, IGNORE_RADIUS,
+    LABEL_RADIUS, LN_DIAMETER, NOMINAL_HEAD_PX, OFFSET_U, OFFSET_UNIT_PX, OFFSET_V, STRIDE, cell_center_px,
+    network_value,
 };
 
 /// Side of the coarse network's training crop, px.
@@ -37,6 +38,8 @@ pub enum Stage {
     Coarse,
     /// Stage 2: clips around a candidate, gamma corrected.
     Fine,
+    /// Stage 2's closer look: every head as large as the others.
+    Close,
 }
 
 impl Stage {
@@ -44,14 +47,14 @@ impl Stage {
     pub fn side_px(self) -> usize {
         match self {
             Stage::Coarse => COARSE_PX,
-            Stage::Fine => CLIP_PX,
+            Stage::Fine | Stage::Close => CLIP_PX,
         }
     }
 
     fn input_channels(self) -> usize {
         match self {
             Stage::Coarse => 3,
-            Stage::Fine => FINE_INPUT_CHANNELS,
+            Stage::Fine | Stage::Close => FINE_INPUT_CHANNELS,
         }
     }
 }
@@ -105,14 +108,19 @@ fn fill(stage: Stage, patch: &Patch, rng: &mut Pcg64Mcg, pixels: &mut [f32], tar
         .first()
         .filter(|_| patch.focused)
         .map(|l| [f64::from(l.u_px), f64::from(l.v_px)]);
-    let jitter = if stage == Stage::Fine && focus.is_some() {
-        3.5
-    } else {
-        10.0
+    let jitter = match stage {
+        Stage::Fine if focus.is_some() => 3.5,
+        Stage::Close if focus.is_some() => 1.5,
+        _ => 10.0,
     };
-    let mut source = focus.filter(|_| stage == Stage::Fine).unwrap_or([middle, middle]);
+    let mut source = focus.filter(|_| stage != Stage::Coarse).unwrap_or([middle, middle]);
     source = source.map(|c| c + normal(jitter).clamp(-12.0, 12.0));
-    let scale = normal(0.10).exp().clamp(0.75, 1.4);
+    let size = match (stage, patch.labels.first().filter(|_| patch.focused)) {
+        (Stage::Close, Some(label)) => CLOSE_HEAD_PX / f64::from(label.diameter_px),
+        (Stage::Close, None) => CLOSE_HEAD_PX / NOMINAL_HEAD_PX,
+        _ => 1.0,
+    };
+    let scale = size * normal(0.10).exp().clamp(0.75, 1.4);
     let tilt: f64 = normal(0.12);
     let mild = normal(0.05).exp().clamp(0.88, 1.14);
     // width over height of a circle is the square of this
@@ -125,10 +133,9 @@ fn fill(stage: Stage, patch: &Patch, rng: &mut Pcg64Mcg, pixels: &mut [f32], tar
     let turn = tilt + std::f64::consts::FRAC_PI_2 * f64::from(rng.random_range(0..4u8));
     let flip = if rng.random_bool(0.5) { -1.0 } else { 1.0 };
     // crop pixel -> patch pixel: squeezed along an axis, turned, perhaps mirrored
-    let half = if stage == Stage::Fine {
-        CLIP_CENTER_PX as f64
-    } else {
-        side as f64 / 2.0
+    let half = match stage {
+        Stage::Coarse => side as f64 / 2.0,
+        Stage::Fine | Stage::Close => CLIP_CENTER_PX as f64,
     };
     let axis = Rotation2::new(along);
     let squeezed = axis * Matrix2::new(squeeze, 0.0, 0.0, 1.0 / squeeze) * axis.inverse();
@@ -158,7 +165,7 @@ fn fill(stage: Stage, patch: &Patch, rng: &mut Pcg64Mcg, pixels: &mut [f32], tar
     relight(&mut rgb, side, rng);
     let bytes: Vec<u8> = rgb.iter().map(|v| v.round().clamp(0.0, 255.0) as u8).collect();
     match stage {
-        Stage::Fine => {
+        Stage::Fine | Stage::Close => {
             let Some(clip) = RgbImage::from_raw(side as u32, side as u32, bytes) else {
                 return;
             };
@@ -192,7 +199,7 @@ fn fill(stage: Stage, patch: &Patch, rng: &mut Pcg64Mcg, pixels: &mut [f32], tar
             Some((r, at, d, label)) if r < LABEL_RADIUS => Target {
                 classes: label.classes,
                 weight: 1.0,
-                regression: (stage == Stage::Fine && label.exact && label.classes != 0).then(|| {
+                regression: (stage != Stage::Coarse && label.exact && label.classes != 0).then(|| {
                     [
                         ((at[0] - x) / OFFSET_UNIT_PX) as f32,
                         ((at[1] - y) / OFFSET_UNIT_PX) as f32,
@@ -203,7 +210,7 @@ fn fill(stage: Stage, patch: &Patch, rng: &mut Pcg64Mcg, pixels: &mut [f32], tar
             Some((r, _, _, label)) if r < IGNORE_RADIUS || (label.classes == 0 && r < 0.8) => Target::default(),
             _ => Target {
                 classes: patch.elsewhere,
-                weight: if stage == Stage::Fine { 0.03 } else { 0.3 },
+                weight: if stage == Stage::Coarse { 0.3 } else { 0.03 },
                 regression: None,
             },
         };
@@ -444,10 +451,9 @@ fn soften(rgb: &mut [f32], side: usize, share: f32) {
 /// Loss and gradient over a batch: cross-entropy against sets of classes, smooth L1 for the regressions, these with `place` times
 /// their weight.
 pub fn loss(stage: Stage, output: &Tensor, targets: &[Target], place: f32, grad: &mut Tensor) -> f32 {
-    let classes = if stage == Stage::Fine {
-        CLASSES
-    } else {
-        vision::layout::COARSE_CHANNELS
+    let classes = match stage {
+        Stage::Coarse => vision::layout::COARSE_CHANNELS,
+        Stage::Fine | Stage::Close => CLASSES,
     };
     *grad = Tensor::zeros(output.n, output.h, output.w, output.c);
     let total: f32 = targets

@@ -68,7 +68,7 @@ pub fn mine(
             .iter()
             .map(|c| c.pixel)
             .collect();
-        let seen: Vec<(Pixel, f64, f32)> = look(fine, picture, &places)?
+        let seen: Vec<(Pixel, f64, f32)> = look(fine, None, picture, &places)?
             .iter()
             .map(|e| {
                 (

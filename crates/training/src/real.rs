@@ -8,6 +8,7 @@ use image::imageops::{self, FilterType};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use sha2::{Digest, Sha256};
+use std::ops::RangeInclusive;
 use std::path::Path;
 use vision::layout::Class;
 
@@ -26,13 +27,18 @@ pub fn held_out(group: &str) -> bool {
 /// Every crop of the training groups at a few sizes, and every labelled item of the training photographs.
 pub fn patches(data: &Path, seed: u64) -> Result<Vec<Patch>, TrainError> {
     let mut rng = Pcg64Mcg::seed_from_u64(seed);
-    let mut patches = crops(data, false, &mut rng)?;
+    let mut patches = crops(data, false, 22.0..=40.0, &mut rng)?;
     patches.extend(photographs(&data.join("photographs"), &mut rng)?);
     Ok(patches)
 }
 
-/// The e-waste crops: those of the training groups, or those held out.
-pub fn crops(data: &Path, held: bool, rng: &mut Pcg64Mcg) -> Result<Vec<Patch>, TrainError> {
+/// The e-waste crops: those of the training groups, or those held out, with heads of those diameters, px.
+pub fn crops(
+    data: &Path,
+    held: bool,
+    heads_px: RangeInclusive<f64>,
+    rng: &mut Pcg64Mcg,
+) -> Result<Vec<Patch>, TrainError> {
     let index = text(&data.join("ewaste.csv"))?;
     let background = only(Class::Background) | only(Class::OtherFeature);
     let mut patches = Vec::new();
@@ -52,7 +58,7 @@ pub fn crops(data: &Path, held: bool, rng: &mut Pcg64Mcg) -> Result<Vec<Patch>, 
             };
             let (x, y) = (tile % COLUMNS * CROP_PX, tile / COLUMNS * CROP_PX);
             let crop = imageops::crop_imm(&atlas, x, y, CROP_PX, CROP_PX).to_image();
-            let head_px = rng.random_range(22.0..40.0);
+            let head_px = rng.random_range(heads_px.clone());
             patches.push(place(&crop, head_px, item, elsewhere));
         }
     }

@@ -1,4 +1,4 @@
-//! Training: patches, two networks, thresholds, one model file; the same bytes from the same settings on any number of threads.
+//! Training: patches, three networks, thresholds, one model file; the same bytes from the same settings on any number of threads.
 
 use crate::batch::{Batch, Stage, batch, loss};
 use crate::boxes::BoxesError;
@@ -17,8 +17,8 @@ use std::{
     ops::Range,
     path::{Path, PathBuf},
 };
-use vision::layout::{Class, coarse_spec, fine_spec};
-use vision::{Detector, Settings, Thresholds, decode_model, encode_model};
+use vision::layout::{CLOSE_HEAD_PX, Class, coarse_spec, fine_spec};
+use vision::{Detector, Networks, Settings, Thresholds, decode_model, encode_model};
 
 /// Units below this seed are learned from.
 pub const TRAINING_SEEDS: Range<u64> = 0..500_000;
@@ -34,6 +34,8 @@ const PICTURED: f64 = 0.3;
 const MINED: f64 = 0.15;
 /// What decides beside the settings what a network learns: a network half trained by another recipe is not gone on with.
 const RECIPE: [&str; 2] = [include_str!("batch.rs"), include_str!("../../vision/src/clip.rs")];
+/// Learning rate of the closer look against that of the network that it goes on from.
+const CLOSE_RATE: f32 = 0.5;
 /// Steps after which a network is written to the work folder.
 const KEEP_EVERY: usize = 500;
 
@@ -105,6 +107,8 @@ pub struct TrainSettings {
     pub coarse_steps: usize,
     /// Steps of the network of stage 2.
     pub fine_steps: usize,
+    /// Steps of the network for the closer look; it begins as the first one of stage 2, where the model that is trained further has none.
+    pub close_steps: usize,
     /// Faces that the half-trained networks look at; where they are wrong is learned from in the rest of the steps. They are of the
     /// units after those that are learned from.
     pub mining_faces: u64,
@@ -142,6 +146,7 @@ impl Default for TrainSettings {
             learning_rate: 0.01,
             coarse_steps: 1900,
             fine_steps: 11000,
+            close_steps: 6000,
             mining_faces: 0,
             tuning_faces: 150,
             seed: 1,
@@ -215,22 +220,20 @@ pub fn train(settings: &TrainSettings, out: &Path, progress: &dyn Progress) -> R
         progress,
     };
     let mut losses = BTreeMap::new();
-    let coarse = match start.get("coarse") {
-        Some(bytes) => Trainer::from_bytes(bytes)?,
+    let coarse = match start {
+        Some(networks) => Trainer::from_bytes(&networks.coarse)?,
         None => Trainer::new(coarse_spec(), settings.seed),
     };
     let coarse = lesson.learn("coarse", coarse, Stage::Coarse, settings.coarse_steps, &mut losses)?;
     // one network gives what the paper's three give (docs/detection.md); a model that is gone on with keeps its number of them
-    let networks = start.keys().filter(|name| name.starts_with("fine")).count().max(1);
-    let mut trainers = Vec::new();
-    for k in 0..networks {
-        let name = format!("fine{k}");
-        let trainer = match start.get(&name) {
-            Some(bytes) => Trainer::from_bytes(bytes)?,
-            None => Trainer::new(fine_spec(), settings.seed + 1),
-        };
-        trainers.push(trainer);
-    }
+    let mut trainers = match start {
+        Some(networks) => networks
+            .fine
+            .iter()
+            .map(|bytes| Trainer::from_bytes(bytes))
+            .collect::<Result<_, _>>()?,
+        None => vec![Trainer::new(fine_spec(), settings.seed + 1)],
+    };
     let mined;
     if settings.mining_faces > 0 {
         // a model that is gone on with can tell at once what it falls for
@@ -257,12 +260,28 @@ pub fn train(settings: &TrainSettings, out: &Path, progress: &dyn Progress) -> R
         )?;
         fine.push(trainer.to_bytes(&BTreeMap::new())?);
     }
-    let coarse = coarse.to_bytes(&BTreeMap::new())?;
+    let close = match start.as_ref().and_then(|networks| networks.close.as_ref()) {
+        None if settings.close_steps > 0 => fine.first(),
+        own => own,
+    };
+    let close = match close {
+        Some(bytes) => {
+            let begun = Trainer::from_bytes(bytes)?;
+            let trainer = lesson.learn("close", begun, Stage::Close, settings.close_steps, &mut losses)?;
+            Some(trainer.to_bytes(&BTreeMap::new())?)
+        }
+        None => None,
+    };
+    let networks = Networks {
+        coarse: coarse.to_bytes(&BTreeMap::new())?,
+        fine,
+        close,
+    };
     let untuned = Settings {
         thresholds: Thresholds::default(),
         ..Settings::default()
     };
-    let detector = Detector::from_bytes(&encode_model(&coarse, &fine, &untuned)?)?;
+    let detector = Detector::from_bytes(&encode_model(&networks, &untuned)?)?;
     let tuning = tune::tune(detector.model(), TUNING_SEEDS.start, settings.tuning_faces, &|done| {
         progress.report("tuning", done, settings.tuning_faces, None);
     })?;
@@ -278,7 +297,7 @@ pub fn train(settings: &TrainSettings, out: &Path, progress: &dyn Progress) -> R
             ("tuning".into(), json!(tuning)),
         ]),
     };
-    let bytes = encode_model(&coarse, &fine, &tuned)?;
+    let bytes = encode_model(&networks, &tuned)?;
     geometry::write_aside(out, &bytes)?;
     Ok(TrainReport {
         model: vision::model_id(&bytes),
@@ -367,10 +386,10 @@ fn picks(pools: &[(f64, Vec<usize>)], n: usize, rng: &mut Pcg64Mcg) -> Vec<usize
         .collect()
 }
 
-/// Settings with the identity of the model that is trained further, and that model's networks by name.
-fn begun(settings: &TrainSettings) -> Result<(TrainSettings, BTreeMap<String, Vec<u8>>), TrainError> {
+/// Settings with the identity of the model that is trained further, and that model's networks.
+fn begun(settings: &TrainSettings) -> Result<(TrainSettings, Option<Networks>), TrainError> {
     let Some(path) = &settings.from else {
-        return Ok((settings.clone(), BTreeMap::new()));
+        return Ok((settings.clone(), None));
     };
     let bytes = std::fs::read(path).map_err(|source| TrainError::Data {
         path: path.clone(),
@@ -381,7 +400,7 @@ fn begun(settings: &TrainSettings) -> Result<(TrainSettings, BTreeMap<String, Ve
         from_model: Some(vision::model_id(&bytes)),
         ..settings.clone()
     };
-    Ok((settings, networks))
+    Ok((settings, Some(networks)))
 }
 
 /// What every network of a training learns from, and how.
@@ -408,15 +427,18 @@ impl Lesson<'_> {
         losses: &mut BTreeMap<String, f32>,
     ) -> Result<Trainer, TrainError> {
         let settings = self.settings;
-        let total = match stage {
-            Stage::Coarse => settings.coarse_steps,
-            Stage::Fine => settings.fine_steps,
+        let (total, highest) = match stage {
+            Stage::Coarse => (settings.coarse_steps, settings.learning_rate),
+            Stage::Fine => (settings.fine_steps, settings.learning_rate),
+            Stage::Close => (settings.close_steps, CLOSE_RATE * settings.learning_rate),
         };
         let kept = settings.work.as_ref().map(|folder| {
             let key = json!([
                 RECIPE,
                 WARM_UP,
                 LATE_PLACE,
+                CLOSE_RATE,
+                CLOSE_HEAD_PX,
                 PICTURED,
                 MINED,
                 settings_key(settings),
@@ -452,7 +474,7 @@ impl Lesson<'_> {
             let now = loss(stage, &output, &targets, place, &mut grad);
             trainer.backward(&grad);
             let rise = ((step + 1) as f32 / WARM_UP as f32).min(1.0);
-            let rate = settings.learning_rate * rise * (1.0 - step as f32 / total as f32);
+            let rate = highest * rise * (1.0 - step as f32 / total as f32);
             trainer.adam_step(rate, 0.0);
             mean_loss = if mean_loss.is_nan() {
                 now

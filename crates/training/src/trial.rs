@@ -63,29 +63,41 @@ pub fn try_network(
     Ok(Trial {
         loss: losses.get("trial").copied().unwrap_or(f32::NAN),
         train_s,
-        ..judged(&[trainer.network().into()], &unseen)?
+        ..judged(&[trainer.network().into()], None, &unseen)?
     })
 }
 
 /// What networks of stage 2 say of the patches of units, for instance to compare those that they learned from with others.
 ///
+/// # Arguments
+/// * `close` – the network that looks closer, if it is to.
+///
 /// # Errors
 /// As [`train`](crate::train()), for the work folder.
-pub fn measure_networks(networks: &[Engine], units: Range<u64>, settings: &TrainSettings) -> Result<Trial, TrainError> {
+pub fn measure_networks(
+    fine: &[Engine],
+    close: Option<&Engine>,
+    units: Range<u64>,
+    settings: &TrainSettings,
+) -> Result<Trial, TrainError> {
     let patches = rendered(units, settings.background, settings.work.as_deref(), &|_| {})?;
-    Ok(judged(networks, &patches)?)
+    Ok(judged(fine, close, &patches)?)
 }
 
 /// The same on a folder of pictures with exact truth (see `pictures.rs`).
 ///
 /// # Errors
 /// [`TrainError`] that names the file.
-pub fn measure_networks_on_pictures(networks: &[Engine], folder: &Path) -> Result<Trial, TrainError> {
+pub fn measure_networks_on_pictures(
+    fine: &[Engine],
+    close: Option<&Engine>,
+    folder: &Path,
+) -> Result<Trial, TrainError> {
     let (patches, _) = pictures::patches(folder, 0)?;
-    Ok(judged(networks, &patches)?)
+    Ok(judged(fine, close, &patches)?)
 }
 
-fn judged(networks: &[Engine], patches: &[Patch]) -> Result<Trial, NnError> {
+fn judged(fine: &[Engine], close: Option<&Engine>, patches: &[Patch]) -> Result<Trial, NnError> {
     let (mut screws, mut others, mut errors) = (Vec::new(), Vec::new(), Vec::new());
     let (mut drives, mut right) = (0, 0);
     for patch in patches {
@@ -96,7 +108,7 @@ fn judged(networks: &[Engine], patches: &[Patch]) -> Result<Trial, NnError> {
         let middle = PATCH_PX as f64 / 2.0;
         // stage 1 is off by a few pixels
         let place = label.map_or([middle; 2], |l| [f64::from(l.u_px) + 2.0, f64::from(l.v_px) - 2.0]);
-        let Some(found) = vision::look(networks, &picture, &[Pixel::new(place[0], place[1])])?.pop() else {
+        let Some(found) = vision::look(fine, close, &picture, &[Pixel::new(place[0], place[1])])?.pop() else {
             continue;
         };
         let score = f64::from(found.of(Class::Cross));

@@ -15,6 +15,7 @@ fn tiny(work: Option<&Path>) -> TrainSettings {
         batch: 8,
         coarse_steps: 4,
         fine_steps: 4,
+        close_steps: 4,
         mining_faces: 1,
         tuning_faces: 0,
         work: work.map(Path::to_owned),
@@ -57,7 +58,7 @@ fn a_training_that_was_stopped_ends_with_the_same_bytes() -> Result<(), Box<dyn 
     assert_eq!(fs::read_to_string(work.join("mined.jsonl"))?.lines().count(), mined);
     assert_eq!(again.loss, report.loss);
     assert!(
-        again.loss.len() == 3 && again.loss.values().all(|l| l.is_finite()),
+        again.loss.len() == 4 && again.loss.values().all(|l| l.is_finite()),
         "{:?}",
         again.loss
     );
@@ -117,29 +118,41 @@ fn pictures_with_truth_are_learned_from_or_named() -> Result<(), Box<dyn std::er
 }
 
 #[test]
-fn a_model_of_one_network_is_gone_on_with_as_one() -> Result<(), Box<dyn std::error::Error>> {
+fn a_model_that_is_gone_on_with_keeps_its_networks() -> Result<(), Box<dyn std::error::Error>> {
     let folder = tempfile::tempdir()?;
-    let (from, out) = (folder.path().join("one.unscrew"), folder.path().join("model.unscrew"));
-    let (mut networks, settings) = vision::decode_model(vision::EMBEDDED_MODEL, "embedded")?;
-    let take = |networks: &mut std::collections::BTreeMap<String, Vec<u8>>, name| networks.remove(name).expect(name);
-    let (coarse, fine) = (take(&mut networks, "coarse"), take(&mut networks, "fine0"));
-    fs::write(&from, vision::encode_model(&coarse, &[fine], &settings)?)?;
+    let (from, out) = (folder.path().join("from.unscrew"), folder.path().join("model.unscrew"));
+    let graphs = |path: &Path| -> Result<Vec<Vec<u8>>, Box<dyn std::error::Error>> {
+        let (networks, _) = vision::decode_model(&fs::read(path)?, "a model")?;
+        let graph = |(_, bytes)| Ok(nn::onnx::export(&nn::Network::from_bytes(bytes)?));
+        networks.named().into_iter().map(graph).collect()
+    };
+    let (networks, settings) = vision::decode_model(vision::EMBEDDED_MODEL, "embedded")?;
+    let without = vision::Networks {
+        close: None,
+        ..networks.clone()
+    };
     let nothing_to_learn = TrainSettings {
         coarse_steps: 0,
         fine_steps: 0,
+        close_steps: 0,
         mining_faces: 0,
         from: Some(from.clone()),
         ..tiny(None)
     };
-    train(&nothing_to_learn, &out, &Silent)?;
-    let graphs = |path| -> Result<Vec<Vec<u8>>, Box<dyn std::error::Error>> {
-        let (networks, _) = vision::decode_model(&fs::read(path)?, "a model")?;
-        let fine = networks.into_iter().filter(|(name, _)| name != "coarse");
-        fine.map(|(_, bytes)| Ok(nn::onnx::export(&nn::Network::from_bytes(&bytes)?)))
-            .collect()
+    for networks in [&networks, &without] {
+        fs::write(&from, vision::encode_model(networks, &settings)?)?;
+        train(&nothing_to_learn, &out, &Silent)?;
+        assert_eq!(graphs(&out)?, graphs(&from)?);
+    }
+    // what looks closer begins as the first of those that it looks closer than
+    let closer = TrainSettings {
+        close_steps: 2,
+        ..nothing_to_learn
     };
-    let after = graphs(&out)?;
-    assert_eq!(after.len(), 1);
-    assert_eq!(after, graphs(&from)?);
+    let report = train(&closer, &out, &Silent)?;
+    assert!(report.loss["close"] < 1.0, "{:?}", report.loss); // 1.9 and more from the start
+    let (after, before) = (graphs(&out)?, graphs(&from)?);
+    assert_eq!(after[..2], before);
+    assert!(after.len() == 3 && after[2] != after[1]);
     Ok(())
 }

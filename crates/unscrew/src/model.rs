@@ -4,7 +4,7 @@ use crate::{Ended, output};
 use anyhow::{Context, Result};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use vision::{Detector, Settings, decode_model, encode_model};
+use vision::{Detector, Networks, Settings, decode_model, encode_model};
 
 /// Which model finds, and what runs its networks.
 #[derive(clap::Args)]
@@ -66,10 +66,10 @@ pub enum Command {
     Import(Import),
 }
 
-/// The networks of a model as `coarse.onnx`, `fine0.onnx`, ...: N, C, H, W floats in, logits out.
+/// The networks of a model as `coarse.onnx`, `fine0.onnx`, ..., `close.onnx`: N, C, H, W floats in, logits out.
 ///
-/// Colours come as -1 (black) to 1 (white); the fine networks see clips of 64 x 64 pixels, gamma corrected, with local contrast as a
-/// fourth channel.
+/// Colours come as -1 (black) to 1 (white); the fine networks and the one that looks closer see clips of 64 x 64 pixels, gamma corrected, with local
+/// contrast as a fourth channel.
 #[derive(clap::Args)]
 #[command(after_help = "Example: unscrew model export --out onnx")]
 pub struct Export {
@@ -93,6 +93,9 @@ pub struct Import {
     /// Networks of stage 2; left out, those of the other model
     #[arg(long, value_name = "FILE", num_args = 1..)]
     fine: Vec<PathBuf>,
+    /// Network of stage 2's closer look; left out, that of the other model, or none with --fine
+    #[arg(long, value_name = "FILE")]
+    close: Option<PathBuf>,
     /// The other model; left out, the built-in one
     #[arg(long, value_name = "FILE")]
     model: Option<PathBuf>,
@@ -101,8 +104,8 @@ pub struct Import {
     out: PathBuf,
 }
 
-/// A model's stage 1, stage 2 and settings.
-fn networks(model: Option<&Path>) -> Result<(Vec<u8>, Vec<Vec<u8>>, Settings)> {
+/// A model's networks and settings.
+fn networks(model: Option<&Path>) -> Result<(Networks, Settings)> {
     let (bytes, name) = match model {
         Some(path) => {
             let name = path.display().to_string();
@@ -110,11 +113,7 @@ fn networks(model: Option<&Path>) -> Result<(Vec<u8>, Vec<Vec<u8>>, Settings)> {
         }
         None => (vision::EMBEDDED_MODEL.to_vec(), "the built-in model".into()),
     };
-    let (mut networks, settings) = decode_model(&bytes, &name)?;
-    let coarse = networks
-        .remove("coarse")
-        .with_context(|| format!("{name} has no coarse network"))?;
-    Ok((coarse, networks.into_values().collect(), settings))
+    Ok(decode_model(&bytes, &name)?)
 }
 
 pub fn run(command: &Command) -> Result<Ended> {
@@ -126,13 +125,9 @@ pub fn run(command: &Command) -> Result<Ended> {
 
 fn export(args: &Export) -> Result<Ended> {
     output::prepare_folder(&args.out)?;
-    let (coarse, fine, _) = networks(args.model.as_deref())?;
-    let fine = fine
-        .iter()
-        .enumerate()
-        .map(|(k, bytes)| (format!("fine{k}.onnx"), bytes));
-    for (name, bytes) in std::iter::once(("coarse.onnx".into(), &coarse)).chain(fine) {
-        let path = args.out.join(name);
+    let (networks, _) = networks(args.model.as_deref())?;
+    for (name, bytes) in networks.named() {
+        let path = args.out.join(format!("{name}.onnx"));
         geometry::write_aside(&path, &nn::onnx::export(&nn::Network::from_bytes(bytes)?))?;
         println!("{}", path.display());
     }
@@ -150,16 +145,20 @@ fn import(args: &Import) -> Result<Ended> {
         }
         chain.with_context(|| format!("reading {name}"))
     };
-    let (mut coarse, mut fine, mut settings) = networks(args.model.as_deref())?;
+    let (mut networks, mut settings) = networks(args.model.as_deref())?;
     if let Some(path) = &args.coarse {
-        coarse = read(path)?;
+        networks.coarse = read(path)?;
     }
     if !args.fine.is_empty() {
-        fine = args.fine.iter().map(read).collect::<Result<_>>()?;
+        networks.fine = args.fine.iter().map(read).collect::<Result<_>>()?;
+        networks.close = None; // it would have most of the say
     }
-    let files: Vec<&PathBuf> = args.coarse.iter().chain(&args.fine).collect();
+    if let Some(path) = &args.close {
+        networks.close = Some(read(path)?);
+    }
+    let files: Vec<&PathBuf> = args.coarse.iter().chain(&args.fine).chain(&args.close).collect();
     settings.facts = BTreeMap::from([("imported".into(), serde_json::json!(files))]);
-    let bytes = encode_model(&coarse, &fine, &settings)?;
+    let bytes = encode_model(&networks, &settings)?;
     Detector::from_bytes(&bytes)?; // inputs and outputs are what detection expects
     geometry::write_aside(&args.out, &bytes)?;
     println!("{} ({})", args.out.display(), vision::model_id(&bytes));

@@ -1,6 +1,7 @@
-//! The centre of a screw to a fraction of a pixel: outer circle, cross edges and the learned centre, fused by their sigmas.
+//! The centre of a screw to a fraction of a pixel: outer circle, cross edges, the learned centre and, where there is depth, the relief, fused by
+//! their sigmas.
 //!
-//! The cues of the paper's Algorithm 1 (grey, equalised, outer circle, cross edges). Each runs alone too, so that an
+//! Circle and cross are the cues of the paper's Algorithm 1 (grey, equalised, outer circle, cross edges). Each runs alone too, so that an
 //! evaluation can say what each of them buys.
 
 use std::f64::consts::TAU;
@@ -11,6 +12,7 @@ use nalgebra::{SMatrix, SVector};
 use serde::{Deserialize, Serialize};
 
 use crate::Corrections;
+use crate::model::CueFactors;
 use crate::picture::Patch;
 
 /// Cues that differ by more than so many sigmas are not of the same thing.
@@ -26,6 +28,8 @@ pub enum Cue {
     Circle,
     /// The fourfold symmetry of the recess.
     Cross,
+    /// The disc that stands out of the sheet, in the depth.
+    Relief,
 }
 
 /// A centre by one cue.
@@ -64,7 +68,7 @@ pub struct Cross {
 pub struct Fused {
     /// Where, and how sure.
     pub center: CueCenter,
-    /// The cues that agreed, in the order learned, circle, cross.
+    /// The cues that agreed.
     pub cues: Vec<Cue>,
 }
 
@@ -443,15 +447,15 @@ pub fn cross(picture: &RgbImage, start: Pixel, diameter_px: f64) -> Option<Cross
 /// Below this the recess is buried, worn off, or no cross: what is found is rust as often as not.
 const MIN_SYMMETRY: f64 = 0.25;
 
-struct Peak {
-    dx: f64,
-    dy: f64,
+pub(crate) struct Peak {
+    pub dx: f64,
+    pub dy: f64,
     /// Smaller of the two principal curvatures, with its sign turned: positive at a maximum.
-    curvature: f64,
+    pub curvature: f64,
 }
 
 /// Maximum of the paraboloid through a 3 x 3 grid of spacing `h`; `None` where there is no maximum.
-fn paraboloid(value: impl Fn(f64, f64) -> f64, h: f64) -> Option<Peak> {
+pub(crate) fn paraboloid(value: impl Fn(f64, f64) -> f64, h: f64) -> Option<Peak> {
     let mut v = [[0f64; 3]; 3];
     for (j, row) in v.iter_mut().enumerate() {
         for (i, v) in row.iter_mut().enumerate() {
@@ -481,32 +485,33 @@ fn paraboloid(value: impl Fn(f64, f64) -> f64, h: f64) -> Option<Peak> {
 /// Fuses the cues by inverse variance; one that contradicts the others is left out.
 ///
 /// # Arguments
+/// * `cues` – each at most once.
+/// * `diameter_px` – of the head.
 /// * `parallax_px` – where something one head diameter below the rim appears, seen from the rim ([`parallax_px`](crate::parallax_px));
 ///   zero where that is not known.
 ///
 /// # Returns
 /// `None` without any cue. Where two cues contradict each other and no third decides, the surer one stays, with a sigma that says so.
 pub fn fuse(
-    learned: Option<CueCenter>,
-    circle: Option<Circle>,
-    cross: Option<Cross>,
+    cues: &[(Cue, CueCenter)],
+    diameter_px: f64,
     parallax_px: [f64; 2],
     corrections: &Corrections,
 ) -> Option<Fused> {
-    let mut held: Vec<(Cue, CueCenter)> = Vec::with_capacity(3);
     let [du, dv] = parallax_px;
-    let corrected = |c: CueCenter, factor: f64, below: f64| CueCenter {
-        sigma_px: c.sigma_px * factor,
-        pixel: Pixel::new(c.pixel.u_px - below * du, c.pixel.v_px - below * dv),
+    let corrected = |&(cue, center): &(Cue, CueCenter)| {
+        let CueFactors {
+            below_rim,
+            sigma,
+            floor,
+        } = corrections.of(cue);
+        let center = CueCenter {
+            pixel: Pixel::new(center.pixel.u_px - below_rim * du, center.pixel.v_px - below_rim * dv),
+            sigma_px: (sigma * center.sigma_px).hypot(floor * diameter_px),
+        };
+        (cue, center)
     };
-    let [learned_below, circle_below, cross_below] = corrections.below_rim;
-    held.extend(learned.map(|c| (Cue::Learned, corrected(c, corrections.learned_sigma, learned_below))));
-    held.extend(circle.map(|c| {
-        let mut center = corrected(c.center, corrections.circle_sigma, circle_below);
-        center.sigma_px = center.sigma_px.hypot(corrections.eccentricity * c.diameter_px);
-        (Cue::Circle, center)
-    }));
-    held.extend(cross.map(|c| (Cue::Cross, corrected(c.center, corrections.cross_sigma, cross_below))));
+    let mut held: Vec<(Cue, CueCenter)> = cues.iter().map(corrected).collect();
     let mut dispute = 0f64;
     while held.len() > 1 {
         let all = mean(&held)?;
@@ -655,36 +660,16 @@ mod tests {
     #[test]
     fn fusion_weighs_and_gates() {
         let corrections = Corrections::default();
-        let cross = |u, s| Cross {
-            center: at(u, s),
-            angle_rad: 0.0,
-            symmetry: 0.9,
+        let fused = |cues: &[(Cue, CueCenter)], parallax_px: f64, corrections: &Corrections| {
+            fuse(cues, 28.0, [parallax_px, 0.0], corrections).expect("cues")
         };
-        let circle = |u, s| Circle {
-            center: at(u, s),
-            diameter_px: 28.0,
-            coverage: 1.0,
-        };
-        let fused = fuse(
-            Some(at(0.1, 0.4)),
-            Some(circle(0.8, 0.05)),
-            Some(cross(0.0, 0.1)),
-            [0.0; 2],
-            &corrections,
-        )
-        .expect("cues");
-        assert_eq!(fused.cues, [Cue::Learned, Cue::Circle, Cue::Cross]);
-        assert!(fused.center.pixel.u_px < 0.06, "the circle has a floor: {fused:?}");
-        let gated = fuse(
-            Some(at(0.1, 0.4)),
-            Some(circle(6.0, 0.05)),
-            Some(cross(0.0, 0.1)),
-            [0.0; 2],
-            &corrections,
-        )
-        .expect("cues");
+        let (learned, cross) = ((Cue::Learned, at(0.1, 0.4)), (Cue::Cross, at(0.0, 0.1)));
+        let all = fused(&[learned, (Cue::Circle, at(0.8, 0.05)), cross], 0.0, &corrections);
+        assert_eq!(all.cues, [Cue::Learned, Cue::Circle, Cue::Cross]);
+        assert!(all.center.pixel.u_px < 0.06, "the circle has a floor: {all:?}");
+        let gated = fused(&[learned, (Cue::Circle, at(6.0, 0.05)), cross], 0.0, &corrections);
         assert_eq!(gated.cues, [Cue::Learned, Cue::Cross]);
-        let dispute = fuse(Some(at(8.0, 0.4)), None, Some(cross(0.0, 0.1)), [0.0; 2], &corrections).expect("cues");
+        let dispute = fused(&[(Cue::Learned, at(8.0, 0.4)), cross], 0.0, &corrections);
         assert_eq!(dispute.cues, [Cue::Cross]);
         assert!(dispute.center.sigma_px > 1.5, "{dispute:?}");
         // the outline lies deeper: seen from aside, it is off, and the fusion knows by how much
@@ -692,11 +677,15 @@ mod tests {
             below_rim: [0.0, 0.2, 0.0],
             ..Corrections::default()
         };
-        let aside = fuse(Some(at(0.0, 0.4)), Some(circle(2.0, 0.05)), None, [10.0, 0.0], &deep).expect("cues");
+        let aside = fused(
+            &[(Cue::Learned, at(0.0, 0.4)), (Cue::Circle, at(2.0, 0.05))],
+            10.0,
+            &deep,
+        );
         assert!(
             aside.cues.len() == 2 && aside.center.pixel.u_px.abs() < 1e-9,
             "{aside:?}"
         );
-        assert!(fuse(None, None, None, [0.0; 2], &corrections).is_none());
+        assert!(fuse(&[], 28.0, [0.0; 2], &corrections).is_none());
     }
 }

@@ -15,10 +15,10 @@ const CONTRAST_FLOOR: f32 = 0.03;
 /// A square of the picture around a candidate; outside the picture its border is repeated.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Clip {
-    /// Picture pixel under clip pixel [`CLIP_CENTER_PX`].
-    middle: [i64; 2],
-    /// Picture pixels per clip pixel along each axis: 1, or -1 where mirrored.
-    sign: [i64; 2],
+    /// Place of the picture under clip pixel [`CLIP_CENTER_PX`].
+    middle: [f64; 2],
+    /// Picture pixels per clip pixel along each axis, negative where mirrored.
+    step: [f64; 2],
     rgb: Vec<u8>,
 }
 
@@ -44,20 +44,58 @@ impl Clip {
                 rgb.extend_from_slice(&raw[at..at + 3]);
             }
         }
-        Self { middle, sign, rgb }
+        Self {
+            middle: middle.map(|c| c as f64),
+            step: sign.map(|s| s as f64),
+            rgb,
+        }
+    }
+
+    /// As [`mirrored`](Self::mirrored), enlarged by `scale` about `center`, between pixels (bilinear).
+    pub(crate) fn enlarged(picture: &RgbImage, center: Pixel<space::Clip>, scale: f64, sign: [i64; 2]) -> Self {
+        let middle = [center.u_px, center.v_px];
+        let step = sign.map(|s| s as f64 / scale);
+        let size = [picture.width(), picture.height()].map(|n| n as usize);
+        // of the two pixels around each place of an axis, the first one's index, and the second one's share
+        let between = |axis: usize| -> [(usize, f32); CLIP_PX] {
+            let [last, most] = [size[axis].saturating_sub(2), size[axis].saturating_sub(1).min(1)].map(|n| n as f64);
+            std::array::from_fn(|c| {
+                let at = middle[axis] + step[axis] * (c as f64 - CLIP_CENTER_PX as f64);
+                let first = at.floor().clamp(0.0, last);
+                (first as usize, (at - first).clamp(0.0, most) as f32)
+            })
+        };
+        let (columns, rows) = (between(0), between(1));
+        let left = columns[0].0.min(columns[CLIP_PX - 1].0);
+        let right = columns[0].0.max(columns[CLIP_PX - 1].0) + 2;
+        let raw = picture.as_raw();
+        let row = |v: usize| {
+            let begin = v.min(size[1] - 1) * size[0];
+            &raw[3 * (begin + left)..3 * (begin + right.min(size[0]))]
+        };
+        let mut between_rows = vec![0f32; 3 * (right - left)];
+        let mut rgb = Vec::with_capacity(CLIP_PX * CLIP_PX * 3);
+        for (v, down) in rows {
+            for ((to, &top), &bottom) in between_rows.iter_mut().zip(row(v)).zip(row(v + 1)) {
+                *to = f32::from(top) + down * (f32::from(bottom) - f32::from(top));
+            }
+            for (u, along) in columns {
+                let pair = &between_rows[3 * (u - left)..][..6];
+                rgb.extend([0, 1, 2].map(|c| (pair[c] + along * (pair[c + 3] - pair[c]) + 0.5) as u8));
+            }
+        }
+        Self { middle, step, rgb }
     }
 
     /// Where a place of the picture lies in the clip.
     pub(crate) fn to_clip(&self, place: Pixel<space::Clip>) -> [f64; 2] {
-        let along =
-            |axis: usize, c: f64| CLIP_CENTER_PX as f64 + self.sign[axis] as f64 * (c - self.middle[axis] as f64);
+        let along = |axis: usize, c: f64| CLIP_CENTER_PX as f64 + (c - self.middle[axis]) / self.step[axis];
         [along(0, place.u_px), along(1, place.v_px)]
     }
 
     /// Where a place of the clip lies in the picture.
     pub(crate) fn to_picture(&self, place: Pixel<space::Clip>) -> Pixel<space::Clip> {
-        let along =
-            |axis: usize, c: f64| self.middle[axis] as f64 + self.sign[axis] as f64 * (c - CLIP_CENTER_PX as f64);
+        let along = |axis: usize, c: f64| self.middle[axis] + self.step[axis] * (c - CLIP_CENTER_PX as f64);
         Pixel::new(along(0, place.u_px), along(1, place.v_px))
     }
 
@@ -154,6 +192,38 @@ mod tests {
                 let at = 3 * (y as usize * CLIP_PX + x as usize);
                 assert_eq!([clip.rgb[at], clip.rgb[at + 1]], [there.u_px as u8, there.v_px as u8]);
             }
+        }
+    }
+
+    #[test]
+    fn an_enlarged_clip_shows_the_same_place() {
+        // two ramps: a pixel's colour tells where it is from
+        let picture = RgbImage::from_fn(120, 100, |x, y| image::Rgb([2 * x as u8, 2 * y as u8, 0]));
+        let center = Pixel::new(61.4, 47.8);
+        for (scale, sign) in [(1.4, [1, 1]), (1.7, [-1, 1]), (0.9, [1, -1]), (2.3, [-1, -1])] {
+            let clip = Clip::enlarged(&picture, center, scale, sign);
+            assert_eq!(clip.to_clip(center), [CLIP_CENTER_PX as f64; 2]);
+            for (x, y) in [(13i32, 15i32), (32, 32), (50, 21)] {
+                let there = clip.to_picture(Pixel::new(f64::from(x), f64::from(y)));
+                let along = f64::from(x - 32) / scale * sign[0] as f64;
+                assert!((there.u_px - center.u_px - along).abs() < 1e-9, "{scale} {sign:?}");
+                let at = 3 * (y as usize * CLIP_PX + x as usize);
+                for (value, place) in [(clip.rgb[at], there.u_px), (clip.rgb[at + 1], there.v_px)] {
+                    assert!(
+                        (f64::from(value) - 2.0 * place).abs() <= 0.51,
+                        "{scale} {sign:?}: {value} {place}"
+                    );
+                }
+            }
+        }
+        let whole = Pixel::new(61.0, 47.0);
+        assert_eq!(Clip::enlarged(&picture, whole, 1.0, [1, 1]), Clip::cut(&picture, whole));
+        let corner = Clip::enlarged(&picture, Pixel::new(0.0, 99.0), 1.5, [1, 1]);
+        assert_eq!(corner.rgb[3 * (63 * CLIP_PX)..][..3], [0, 198, 0]); // the border goes on
+        for (width, height) in [(1, 1), (1, 9), (9, 1)] {
+            let small = RgbImage::from_pixel(width, height, image::Rgb([7; 3]));
+            let clip = Clip::enlarged(&small, Pixel::new(0.3, 0.0), 1.5, [1, -1]);
+            assert!(clip.rgb.iter().all(|&value| value == 7));
         }
     }
 

@@ -18,6 +18,7 @@ use crate::layout::{CLIP_PX, Class, STRIDE};
 use crate::locate::{RimProfile, facings, locate, parallax_px};
 use crate::picture::{Level, pyramid_scales};
 use crate::quality::{Doubt, doubts};
+use crate::relief::relief;
 use crate::{Model, ModelError};
 
 /// Two finds nearer than this, in head diameters, are the same fastener.
@@ -343,22 +344,33 @@ impl Detector {
         finds.retain(|f| region.contains(f.pixel) && heads.contains(&f.diameter_px));
         let finds = merge(finds);
         let start = Instant::now();
-        let told: Vec<Option<Told>> = finds
+        let told: Vec<(Option<RimProfile>, Option<Told>)> = finds
             .par_iter()
-            .map(|find| self.tell(find, rise_mm(find, space), options))
+            .map(|find| {
+                let profile = profile(find, space);
+                let rise_mm = profile.map(|profile| profile.rise_mm());
+                (profile, self.tell(find, rise_mm, options))
+            })
             .collect();
         // the likeliest come first
-        let last = told.iter().rposition(Option::is_some).map_or(0, |last| last + 1);
+        let last = told
+            .iter()
+            .rposition(|(_, told)| told.is_some())
+            .map_or(0, |last| last + 1);
         let around = finds.len().min(last.max(ENOUGH_HEADS));
         let mut screws: Vec<Screw> = finds[..around]
             .par_iter()
             .zip(told)
             .zip(sheet_normals(&finds[..around], space))
-            .filter_map(|((find, told), normal)| {
+            .filter_map(|((find, (profile, told)), normal)| {
                 let parallax_px = space.zip(normal).map_or([0.0; 2], |((_, camera), normal)| {
                     parallax_px(camera, find.pixel, normal, find.diameter_px)
                 });
-                let screw = self.measure(picture, find, told?, parallax_px)?;
+                let told = told?;
+                let raised = space.zip(profile).filter(|_| told.verdict != Verdict::Other);
+                let raised = raised
+                    .and_then(|((depth, _), profile)| relief(depth, &profile.sheet, find.pixel, find.diameter_px));
+                let screw = self.measure(picture, find, told, raised, parallax_px)?;
                 Some(Screw { normal, ..screw })
             })
             .collect();
@@ -422,7 +434,7 @@ impl Detector {
             .collect();
         timing_ms.coarse += ms_since(start);
         let start = Instant::now();
-        let evidence = look(&self.model.fine, &level.picture, &places)?;
+        let evidence = look(&self.model.fine, self.model.close.as_ref(), &level.picture, &places)?;
         timing_ms.fine += ms_since(start);
         let in_image = |evidence: Evidence| Find {
             pixel: level.to_image(evidence.center),
@@ -450,7 +462,8 @@ impl Detector {
         let seen = calibrated(probability(options.bit));
         let fits = options.odds * seen / (options.odds * seen + 1.0 - seen);
         let t = &settings.thresholds;
-        let (verdict, score) = if fits >= f64::from(t.accept) {
+        // what is likelier another drive's is not acted on, however little a false find costs
+        let (verdict, score) = if fits >= f64::from(t.accept) && likeliest == options.bit {
             (Verdict::Screw, fits)
         } else if fits >= f64::from(t.review) {
             (Verdict::Review, fits)
@@ -469,8 +482,15 @@ impl Detector {
         })
     }
 
-    /// Centre of a find by all cues; `None` where it has none.
-    fn measure(&self, picture: &RgbImage, find: &Find, told: Told, parallax_px: [f64; 2]) -> Option<Screw> {
+    /// Centre of a find by all cues, `raised` the one in its depth; `None` where it has none.
+    fn measure(
+        &self,
+        picture: &RgbImage,
+        find: &Find,
+        told: Told,
+        raised: Option<CueCenter>,
+        parallax_px: [f64; 2],
+    ) -> Option<Screw> {
         let Told {
             verdict,
             drive,
@@ -485,8 +505,16 @@ impl Detector {
         let crossed = (drive == Drive::Cross || drive == Drive::Unknown)
             .then(|| cross(picture, find.pixel, find.diameter_px))
             .flatten();
+        let cues = [
+            Some((Cue::Learned, learned)),
+            circle.map(|circle| (Cue::Circle, circle.center)),
+            crossed.map(|cross| (Cue::Cross, cross.center)),
+            raised.map(|raised| (Cue::Relief, raised)),
+        ];
+        let cues: Vec<_> = cues.into_iter().flatten().collect();
         let corrections = &self.model.settings.corrections;
-        let fused = fuse(Some(learned), circle, crossed, parallax_px, corrections)?;
+        let diameter_px = circle.map_or(find.diameter_px, |circle| circle.diameter_px);
+        let fused = fuse(&cues, diameter_px, parallax_px, corrections)?;
         let used = |cue| fused.cues.contains(&cue);
         Some(Screw {
             pixel: fused.center.pixel,
@@ -536,10 +564,10 @@ fn sheet_normals(finds: &[Find], space: Option<(&DepthMap, &CameraModel)>) -> Ve
     facings(depth, camera, &heads)
 }
 
-/// How far a find rises above the sheet around it, mm; not asked for what is surely nothing.
-fn rise_mm(find: &Find, space: Option<(&DepthMap, &CameraModel)>) -> Option<f64> {
+/// How a find rises above the sheet around it; not asked for what is surely nothing.
+fn profile(find: &Find, space: Option<(&DepthMap, &CameraModel)>) -> Option<RimProfile> {
     let (depth, camera) = space.filter(|_| find.evidence.fastener() >= MAY_BE)?;
-    RimProfile::of(depth, camera, find.pixel, find.diameter_px).map(|profile| profile.rise_mm())
+    RimProfile::of(depth, camera, find.pixel, find.diameter_px)
 }
 
 /// One find for each fastener: candidates and scales that met on the same one become the most certain of them.
@@ -614,6 +642,13 @@ mod tests {
         assert_eq!(verdict(0.45, 0.1, Drive::Cross), Some((Verdict::Review, Drive::Cross)));
         assert_eq!(verdict(0.29, 0.28, Drive::Cross), Some((Verdict::Other, Drive::Cross)));
         assert_eq!(verdict(0.05, 0.1, Drive::Cross), None);
+        // a false find may cost so little that less than half suffices: not where another drive is likelier
+        let mut bold = detector.model().clone();
+        bold.settings.thresholds.accept = 0.33;
+        let bold = Detector::new(bold);
+        let verdict = |cross, slotted| bold.tell(&find(50.0, 30.0, cross, slotted), None, &Options::default());
+        assert_eq!(verdict(0.45, 0.1).map(|t| t.verdict), Some(Verdict::Screw));
+        assert_eq!(verdict(0.45, 0.5).map(|t| t.verdict), Some(Verdict::Review));
         Ok(())
     }
 

@@ -7,7 +7,7 @@ use rayon::prelude::*;
 
 use crate::clip::Clip;
 use crate::layout::{
-    CLASS_CHANNELS, CLASSES, CLIP_PX, Class, FINE_CHANNELS, FINE_INPUT_CHANNELS, LN_DIAMETER, MAP_CELLS,
+    CLASS_CHANNELS, CLASSES, CLIP_PX, CLOSE_HEAD_PX, Class, FINE_CHANNELS, FINE_INPUT_CHANNELS, LN_DIAMETER, MAP_CELLS,
     NOMINAL_HEAD_PX, OFFSET_U, OFFSET_UNIT_PX, OFFSET_V, TRAINED_HEAD_PX, cell_center_px,
 };
 
@@ -20,10 +20,12 @@ const CELLS_A_VOTE: f64 = 4.0;
 /// Clips that go through the networks at once: bounds the memory.
 const BATCH: usize = 64;
 
-/// From this probability of a fastener on, the whole ensemble looks, from all sides.
+/// From this probability of a fastener on, there are more looks than the first.
 const WORTH_MORE: f32 = 0.05;
 /// The clip as it is, and its mirror images: signs along u and v. The networks' errors differ between them.
 const VIEWS: [[i64; 2]; 4] = [[1, 1], [-1, 1], [1, -1], [-1, -1]];
+/// Views of the clip as it is, before the closer ones.
+const FAR_LOOKS: usize = 2;
 
 /// What the ensemble says about one candidate, in the pixels of the picture that it saw.
 #[derive(Clone, Debug, PartialEq)]
@@ -50,30 +52,48 @@ impl Evidence {
     }
 }
 
-/// Looks at each place with the first network; where that says that there may be a fastener, the whole ensemble looks at the clip
-/// around the centre that it voted for, and at the three mirror images of it, as long as the mean so far still says so; the mean
-/// decides.
+/// Looks at each place with the first of the fine networks. Where that says that there may be a fastener, all of them look at the clip
+/// around the centre that it voted for, from two sides, then the network that looks closer, from four sides, at clips around the mean centre so
+/// far with the head [`CLOSE_HEAD_PX`] wide, as long as the mean still says so; the mean decides. Without such a network the fine ones look from all sides.
 ///
 /// # Arguments
-/// * `networks` – one network is an ensemble too.
+/// * `fine` – one network is an ensemble too.
 ///
 /// # Returns
 /// Evidence for each place, in the same order.
 ///
 /// # Errors
 /// [`NnError`] where an engine from outside fails; the own one does not.
-pub fn look(networks: &[Engine], picture: &RgbImage, places: &[Pixel<space::Clip>]) -> Result<Vec<Evidence>, NnError> {
-    if picture.width() == 0 || picture.height() == 0 || networks.is_empty() {
+pub fn look(
+    fine: &[Engine],
+    close: Option<&Engine>,
+    picture: &RgbImage,
+    places: &[Pixel<space::Clip>],
+) -> Result<Vec<Evidence>, NnError> {
+    if picture.width() == 0 || picture.height() == 0 || fine.is_empty() {
         return Ok(Vec::new());
     }
-    let mut evidence = look_once(&networks[..1], picture, places, VIEWS[0])?;
+    let as_it_is = |center| Place { center, scale: None };
+    let first: Vec<_> = places.iter().map(|&center| as_it_is(center)).collect();
+    let mut evidence = look_once(&fine[..1], picture, &first, VIEWS[0])?;
     let mut worth: Vec<usize> = (0..evidence.len())
         .filter(|&i| evidence[i].fastener() >= WORTH_MORE)
         .collect();
     let mut looks: Vec<Vec<Evidence>> = vec![Vec::new(); evidence.len()];
     let centers: Vec<_> = evidence.iter().map(|e| e.center).collect();
-    for sign in VIEWS {
-        let places: Vec<_> = worth.iter().map(|&i| centers[i]).collect();
+    let far = if close.is_some() { FAR_LOOKS } else { VIEWS.len() };
+    let far = VIEWS[..far].iter().map(|&sign| (fine, false, sign));
+    let close = close.map(std::slice::from_ref).into_iter();
+    let close = close.flat_map(|network| VIEWS.map(|sign| (network, true, sign)));
+    for (networks, closer, sign) in far.chain(close) {
+        let place = |i: usize| match closer {
+            true => Place {
+                center: evidence[i].center,
+                scale: Some(CLOSE_HEAD_PX / evidence[i].diameter_px),
+            },
+            false => as_it_is(centers[i]),
+        };
+        let places: Vec<_> = worth.iter().map(|&i| place(i)).collect();
         for (&i, look) in worth.iter().zip(look_once(networks, picture, &places, sign)?) {
             looks[i].push(look);
             // a mirror image may have settled on a neighbour
@@ -85,6 +105,22 @@ pub fn look(networks: &[Engine], picture: &RgbImage, places: &[Pixel<space::Clip
         worth.retain(|&i| evidence[i].fastener() >= WORTH_MORE);
     }
     Ok(evidence)
+}
+
+/// Where a clip is cut: around a centre, pixel by pixel, or enlarged.
+#[derive(Clone, Copy)]
+struct Place {
+    center: Pixel<space::Clip>,
+    scale: Option<f64>,
+}
+
+impl Place {
+    fn clip(&self, picture: &RgbImage, sign: [i64; 2]) -> Clip {
+        match self.scale {
+            Some(scale) => Clip::enlarged(picture, self.center, scale, sign),
+            None => Clip::mirrored(picture, self.center, sign),
+        }
+    }
 }
 
 /// What several looks at one thing say together.
@@ -119,12 +155,12 @@ fn normalized(ln: [f32; CLASSES]) -> [f32; CLASSES] {
 fn look_once(
     networks: &[Engine],
     picture: &RgbImage,
-    places: &[Pixel<space::Clip>],
+    places: &[Place],
     sign: [i64; 2],
 ) -> Result<Vec<Evidence>, NnError> {
     let mut evidence = Vec::with_capacity(places.len());
     for places in places.chunks(BATCH) {
-        let clips: Vec<Clip> = places.iter().map(|&p| Clip::mirrored(picture, p, sign)).collect();
+        let clips: Vec<Clip> = places.iter().map(|place| place.clip(picture, sign)).collect();
         let mut batch = Tensor::zeros(clips.len(), CLIP_PX, CLIP_PX, FINE_INPUT_CHANNELS);
         batch
             .data
@@ -139,14 +175,17 @@ fn look_once(
                 Ok(map)
             })
             .collect::<Result<_, NnError>>()?;
-        evidence.par_extend(clips.par_iter().zip(places).enumerate().map(|(n, (clip, &place))| {
+        evidence.par_extend(clips.par_iter().zip(places).enumerate().map(|(n, (clip, place))| {
             let maps: Vec<&[f32]> = maps
                 .iter()
                 .map(|map| &map.data[map.index(n, 0, 0)..][..MAP_CELLS * MAP_CELLS * FINE_CHANNELS])
                 .collect();
-            let evidence = judge(&maps, clip.to_clip(place));
+            let evidence = judge(&maps, clip.to_clip(place.center));
+            let scale = place.scale.unwrap_or(1.0);
             Evidence {
                 center: clip.to_picture(evidence.center),
+                sigma_px: evidence.sigma_px / scale,
+                diameter_px: evidence.diameter_px / scale,
                 ..evidence
             }
         }));

@@ -1,12 +1,13 @@
 //! What the networks see and what their outputs mean: the one place that training and detection share.
 //!
-//! Both networks answer at every fourth pixel: output cell `i` speaks of input pixel `4 * i` (they halve once more and enlarge
+//! All networks answer at every fourth pixel: output cell `i` speaks of input pixel `4 * i` (they halve once more and enlarge
 //! at their end; they have learned the half cell by which that is off).
 //!
 //! | network | input | output channels |
 //! |---|---|---|
 //! | coarse | a whole picture, RGB, [`network_value`] | 2 logits: background, something that may be a fastener's head |
 //! | fine | a clip of 64 x 64 pixels, RGB gamma corrected and local contrast ([`crate::Clip::network_input`]) | 7 logits ([`Class`]), then du, dv, ln diameter |
+//! | close | as fine, enlarged or shrunk until the head is [`CLOSE_HEAD_PX`] wide | as fine |
 
 use std::ops::{Range, RangeInclusive};
 
@@ -18,7 +19,10 @@ pub const TRAINED_HEAD_PX: RangeInclusive<f64> = 18.0..=44.0;
 /// Head diameter, px, in the middle of that band.
 pub const NOMINAL_HEAD_PX: f64 = 28.0;
 
-/// Input pixels per output cell along each axis, of both networks.
+/// Head diameter, px, to which a clip is enlarged or shrunk for a closer look: larger than most heads are in a picture.
+pub const CLOSE_HEAD_PX: f64 = 40.0;
+
+/// Input pixels per output cell along each axis, of all networks.
 pub const STRIDE: usize = 4;
 
 /// Output channels of the coarse network.

@@ -2,9 +2,9 @@
 //!
 //! The first two steps of the way of one unit: `RgbdFrame` → [`Detector::detect`] → [`Screw`] (pixel ± σ, and `Point<Camera>` where
 //! there is depth); a calibration map takes it from there. It is Algorithm 1 of the paper: a high-recall network over the whole
-//! picture ([`coarse_map`], [`candidates`]), a high-precision one, or the mean of several, on gamma-corrected clips ([`look`]), the centre from
-//! outer circle, cross edges and the networks' votes ([`outer_circle`], [`cross`], [`fuse`]), and the depth of the recess rim
-//! ([`locate`]).
+//! picture ([`coarse_map`], [`candidates`]), a high-precision one, or the mean of several, on gamma-corrected clips, and one that looks closer
+//! ([`look`]), the centre from outer circle, cross edges, the networks' votes and what stands out in the depth ([`outer_circle`], [`cross`],
+//! [`relief()`], [`fuse`]), and the depth of the recess rim ([`locate`]).
 //!
 //! ```
 //! use geometry::RgbdFrame;
@@ -39,6 +39,7 @@ mod model;
 mod overlay;
 mod picture;
 mod quality;
+mod relief;
 mod report;
 #[cfg(test)]
 mod synthetic;
@@ -51,8 +52,10 @@ pub use fine::{Evidence, look};
 pub use locate::{DepthSource, Located, RIM_TERMS, RimProfile, facings, locate, parallax_px};
 pub use marker::{LocatedMarker, Marker, MarkerError, MarkerSpec, find_marker, locate_marker};
 pub use model::{
-    Corrections, EMBEDDED_MODEL, Model, ModelError, Settings, Thresholds, decode_model, encode_model, model_id,
+    Corrections, EMBEDDED_MODEL, Model, ModelError, Networks, Settings, Thresholds, decode_model, encode_model,
+    model_id,
 };
 pub use overlay::{overlay, verdict_color};
 pub use quality::{Doubt, doubts};
+pub use relief::relief;
 pub use report::{Hull, ImageReport, Mapped, ScrewReport};

@@ -1,7 +1,6 @@
 //! From a pixel to a point in space: depth at the plane of the recess rim, in spite of the slot, holes and edges.
 
 use geometry::{Camera, CameraModel, DepthMap, Direction, Pixel, Point, SurfaceSample};
-use nalgebra::Vector3;
 use rayon::prelude::*;
 
 use crate::Corrections;
@@ -105,8 +104,8 @@ pub fn locate(
         point: camera.unproject(pixel, depth_mm),
         sigma_depth_mm,
         sigma_lateral_mm: sigma_px * camera.pixel_mm(depth_mm),
-        normal: normal(&sheet, camera, pixel)?,
-        top_normal: top.and_then(|top| normal(&top, camera, pixel)),
+        normal: sheet.normal(camera, pixel)?,
+        top_normal: top.and_then(|top| top.normal(camera, pixel)),
         source,
     })
 }
@@ -132,10 +131,7 @@ impl RimProfile {
         let points = depth.neighbourhood(pixel, 0.0, RINGS[RIM_TERMS - 1] * diameter_px);
         let heights: Vec<(f64, f64)> = points
             .iter()
-            .map(|[u, v, z]| {
-                let plane = sheet.depth_mm + sheet.slope_mm_per_px[0] * u + sheet.slope_mm_per_px[1] * v;
-                (u.hypot(*v) / diameter_px, plane - z)
-            })
+            .map(|[u, v, z]| (u.hypot(*v) / diameter_px, sheet.depth_at_mm([*u, *v]) - z))
             .collect();
         // what is higher than a head hangs before it, a cable; if all is, the head stands on something before that sheet
         let is_head = |height_mm: f64| height_mm < HIGHEST * head_mm;
@@ -204,7 +200,9 @@ pub fn facings(depth: &DepthMap, camera: &CameraModel, heads: &[(Pixel, f64)]) -
         .map(|&(pixel, diameter_px)| {
             let [inner, outer] = SHEET_RING.map(|r| r * diameter_px);
             let plane = depth.plane_at(pixel, inner, outer)?;
-            normal(&plane, camera, pixel).filter(|n| n.vector().z < -STEEPEST_SHEET.cos())
+            plane
+                .normal(camera, pixel)
+                .filter(|n| n.vector().z < -STEEPEST_SHEET.cos())
         })
         .collect();
     let median = |axis: usize| {
@@ -242,7 +240,7 @@ fn sheet(depth: &DepthMap, camera: &CameraModel, pixel: Pixel, diameter_px: f64)
     let middle = head.len() / 2;
     let top_mm = (!head.is_empty()).then(|| *head.select_nth_unstable_by(middle, f64::total_cmp).1);
     let is_under = |plane: &SurfaceSample| {
-        let along_axis = normal(plane, camera, pixel).map_or(0.0, |n| n.vector().z.abs());
+        let along_axis = plane.normal(camera, pixel).map_or(0.0, |n| n.vector().z.abs());
         let highest_mm = HIGHEST * diameter_px * camera.pixel_mm(plane.depth_mm);
         along_axis > STEEPEST_SHEET.cos() && top_mm.is_none_or(|top_mm| plane.depth_mm - top_mm < highest_mm)
     };
@@ -254,21 +252,7 @@ fn sheet(depth: &DepthMap, camera: &CameraModel, pixel: Pixel, diameter_px: f64)
 
 fn believable(plane: &SurfaceSample, camera: &CameraModel, pixel: Pixel) -> bool {
     let steep = 1.0 / (1.0 + STEEPEST * STEEPEST).sqrt();
-    plane.depth_mm > 1.0 && normal(plane, camera, pixel).is_some_and(|n| n.vector().z.abs() > steep)
-}
-
-/// Normal of the plane through three points of it around the pixel.
-fn normal(plane: &SurfaceSample, camera: &CameraModel, pixel: Pixel) -> Option<Direction<Camera>> {
-    let at = |du: f64, dv: f64| -> Vector3<f64> {
-        let z = plane.depth_mm + plane.slope_mm_per_px[0] * du + plane.slope_mm_per_px[1] * dv;
-        camera
-            .unproject(Pixel::new(pixel.u_px + du, pixel.v_px + dv), z)
-            .vector()
-    };
-    let middle = at(0.0, 0.0);
-    let normal = (at(4.0, 0.0) - middle).cross(&(at(0.0, 4.0) - middle));
-    // Towards the camera: against the viewing ray.
-    Direction::from_vector(if normal.dot(&middle) > 0.0 { -normal } else { normal })
+    plane.depth_mm > 1.0 && plane.normal(camera, pixel).is_some_and(|n| n.vector().z.abs() > steep)
 }
 
 #[cfg(test)]

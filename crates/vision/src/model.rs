@@ -1,23 +1,29 @@
-//! The model file: the coarse network, the fine ones, and the figures that training measured, in one file.
+//! The model file: the coarse network, the fine ones, the one that looks closer, and the figures that training measured, in one file.
 //!
-//! `UNSCREW1`, the length of the header (u32, little endian), the header (JSON), then the networks' bytes one after the other, as
+//! `UNSCREW1` (`UNSCREW2` where one looks closer), the length of the header (u32, little endian), the header (JSON), then the networks' bytes one after the other, as
 //! the header lists them. Each network is a safetensors file with its own architecture, or
 //! an ONNX graph for whoever has ONNX Runtime.
 
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use nn::{Engine, NnError};
+use nn::{Engine, NnError, Step};
 use serde::{Deserialize, Serialize};
 
-use crate::layout::{COARSE_CHANNELS, COARSE_INPUT, FINE_CHANNELS, FINE_INPUT, FINE_INPUT_CHANNELS, STRIDE};
+use crate::center::Cue;
+use crate::layout::{COARSE_CHANNELS, COARSE_INPUT, FINE_CHANNELS, FINE_INPUT, STRIDE};
 use crate::locate::{RIM_TERMS, USUAL_RIM};
 
 const MAGIC: &[u8; 7] = b"UNSCREW";
-/// Version of the container, the eighth byte of the file.
+/// Version of the container, the eighth byte of the file; and that of one with a network that looks closer, which programs of before would take for
+/// one of the fine ones.
 const VERSION: u8 = b'1';
+const VERSION_CLOSE: u8 = b'2';
 /// Bytes before the header.
 const PREAMBLE: usize = 12;
+/// Names of the networks in the file; any other is one of the fine ones.
+const COARSE: &str = "coarse";
+const CLOSE: &str = "close";
 
 /// The model that ships with the program.
 pub static EMBEDDED_MODEL: &[u8] = include_bytes!("../models/default.unscrew");
@@ -54,7 +60,7 @@ impl Default for Thresholds {
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Corrections {
-    /// True error over stated sigma of the outer circle's centre.
+    /// True error over stated sigma of the outer circle's centre, beyond the eccentricity.
     pub circle_sigma: f64,
     /// How far a head's outline may be off its recess, standard deviation along each axis in head diameters: eccentric recesses and
     /// washers. The circle is never surer than this.
@@ -66,6 +72,12 @@ pub struct Corrections {
     pub cross_sigma: f64,
     /// True error over stated sigma of the learned centre.
     pub learned_sigma: f64,
+    /// How far below the rim that lies which the relief's centre rests on, in head diameters; see [`below_rim`](Self::below_rim).
+    pub relief_below_rim: f64,
+    /// True error over stated sigma of the relief's centre, beyond the floor.
+    pub relief_sigma: f64,
+    /// What the relief is never surer than, in head diameters; see [`eccentricity`](Self::eccentricity).
+    pub relief_floor: f64,
     /// Sigma of a centre by that of the fused cues and by how doubtful the find is: its logarithm is `a + b ln sigma + c ln(1 - fits)`;
     /// `[a, b, c]`. Worn and covered heads are off by more than their cues say.
     pub center_sigma: [f64; 3],
@@ -86,7 +98,33 @@ pub struct Corrections {
     pub raised_score: [f64; 5],
 }
 
+/// What [`Corrections`] say about one cue of a centre.
+pub(crate) struct CueFactors {
+    /// How far below the recess rim that lies which it rests on, in head diameters.
+    pub below_rim: f64,
+    /// True error over stated sigma.
+    pub sigma: f64,
+    /// What is added to that sigma, in head diameters.
+    pub floor: f64,
+}
+
 impl Corrections {
+    /// Those of a cue.
+    pub(crate) fn of(&self, cue: Cue) -> CueFactors {
+        let [learned, circle, cross] = self.below_rim;
+        let (below_rim, sigma, floor) = match cue {
+            Cue::Learned => (learned, self.learned_sigma, 0.0),
+            Cue::Circle => (circle, self.circle_sigma, self.eccentricity),
+            Cue::Cross => (cross, self.cross_sigma, 0.0),
+            Cue::Relief => (self.relief_below_rim, self.relief_sigma, self.relief_floor),
+        };
+        CueFactors {
+            below_rim,
+            sigma,
+            floor,
+        }
+    }
+
     /// The networks' probability, corrected; with how far what it is of rises above the sheet, mm, where that was measured.
     pub fn probability(&self, p: f64, rise_mm: Option<f64>) -> f64 {
         let dot = |weights: &[f64], terms: &[f64]| weights.iter().zip(terms).map(|(w, t)| w * t).sum::<f64>();
@@ -128,6 +166,9 @@ impl Default for Corrections {
             below_rim: [0.0; 3],
             cross_sigma: 1.0,
             learned_sigma: 1.0,
+            relief_below_rim: 0.16,
+            relief_sigma: 2.0,
+            relief_floor: 0.02,
             center_sigma: [0.0, 1.0, 0.0],
             rim_height: USUAL_RIM,
             rim_spread: 0.03,
@@ -184,7 +225,9 @@ pub enum ModelError {
         file: String,
     },
     /// It was made by another version.
-    #[error("{file} has model format {found:?}, this program reads '1'; update the program, or train the model again")]
+    #[error(
+        "{file} has model format {found:?}, this program reads '1' and '2'; update the program, or train the model again"
+    )]
     Version {
         /// The file.
         file: String,
@@ -238,6 +281,8 @@ pub struct Model {
     pub coarse: Engine,
     /// Stage 2: one network, or several whose mean decides (three in the paper).
     pub fine: Vec<Engine>,
+    /// Stage 2's closer look at what may be a fastener, every head made as large as the others; models of before have none.
+    pub close: Option<Engine>,
     /// Thresholds, corrections, facts.
     pub settings: Settings,
     id: String,
@@ -273,45 +318,33 @@ impl Model {
     }
 
     fn named(bytes: &[u8], file: &str) -> Result<Self, ModelError> {
-        let (header, mut rest) = split(bytes, file)?;
-        let (mut coarse, mut fine) = (None, Vec::new());
-        for entry in header.networks {
-            let (blob, tail) = rest.split_at(entry.bytes); // `split` checked the sum
-            rest = tail;
+        let (networks, settings) = decode_model(bytes, file)?;
+        let engine = |name: &str, blob: &[u8], input: &[Step], outputs: usize| {
             let network = Engine::from_bytes(blob).map_err(|source| ModelError::Network {
                 file: file.into(),
-                network: entry.name.clone(),
+                network: name.into(),
                 source,
             })?;
-            let is_coarse = entry.name == "coarse";
-            let (inputs, outputs) = if is_coarse {
-                (3, COARSE_CHANNELS)
-            } else {
-                (FINE_INPUT_CHANNELS, FINE_CHANNELS)
-            };
-            check_shape(&network, inputs, outputs).map_err(|reason| ModelError::Shape {
+            check_shape(&network, input.len(), outputs).map_err(|reason| ModelError::Shape {
                 file: file.into(),
-                network: entry.name.clone(),
+                network: name.into(),
                 reason,
             })?;
-            if is_coarse {
-                coarse = Some(network.in_eight_bits(&COARSE_INPUT));
-            } else {
-                fine.push(network.in_eight_bits(&FINE_INPUT));
-            }
-        }
-        match coarse {
-            Some(coarse) if !fine.is_empty() => Ok(Self {
-                coarse,
-                fine,
-                settings: header.settings,
-                id: model_id(bytes),
-            }),
-            _ => Err(ModelError::Header {
-                file: file.into(),
-                reason: "it lists no coarse network or no fine one".into(),
-            }),
-        }
+            Ok(network.in_eight_bits(input))
+        };
+        let fine = networks.fine.iter().enumerate();
+        let close = networks.close.as_ref();
+        Ok(Self {
+            coarse: engine(COARSE, &networks.coarse, &COARSE_INPUT, COARSE_CHANNELS)?,
+            fine: fine
+                .map(|(k, blob)| engine(&format!("fine{k}"), blob, &FINE_INPUT, FINE_CHANNELS))
+                .collect::<Result<_, ModelError>>()?,
+            close: close
+                .map(|blob| engine(CLOSE, blob, &FINE_INPUT, FINE_CHANNELS))
+                .transpose()?,
+            settings,
+            id: model_id(bytes),
+        })
     }
 
     /// The same model with its networks run by ONNX Runtime.
@@ -331,12 +364,18 @@ impl Model {
                 }),
             there => Ok(there),
         };
-        let coarse = moved("coarse".into(), self.coarse)?;
+        let coarse = moved(COARSE.into(), self.coarse)?;
         let fine = self.fine.into_iter().enumerate();
         let fine = fine
             .map(|(k, engine)| moved(format!("fine{k}"), engine))
             .collect::<Result<_, _>>()?;
-        Ok(Self { coarse, fine, ..self })
+        let close = self.close.map(|engine| moved(CLOSE.into(), engine)).transpose()?;
+        Ok(Self {
+            coarse,
+            fine,
+            close,
+            ..self
+        })
     }
 
     /// `sha256:` and the hash of the file: names the model in every result.
@@ -345,52 +384,80 @@ impl Model {
     }
 }
 
+/// A model's networks as [`nn`] saves them: for tools that make model files or take them apart.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Networks {
+    /// Stage 1.
+    pub coarse: Vec<u8>,
+    /// Stage 2: one network or several.
+    pub fine: Vec<Vec<u8>>,
+    /// Stage 2's closer look.
+    pub close: Option<Vec<u8>>,
+}
+
+impl Networks {
+    /// Each by its name in the file, in the file's order.
+    pub fn named(&self) -> Vec<(String, &[u8])> {
+        let fine = self.fine.iter().enumerate();
+        let mut named = vec![(COARSE.to_owned(), self.coarse.as_slice())];
+        named.extend(fine.map(|(k, blob)| (format!("fine{k}"), blob.as_slice())));
+        named.extend(self.close.iter().map(|blob| (CLOSE.to_owned(), blob.as_slice())));
+        named
+    }
+}
+
 /// The bytes of a model file.
-///
-/// # Arguments
-/// * `coarse`, `fine` – the networks as [`nn`] saves them.
 ///
 /// # Errors
 /// [`ModelError::Header`] where the header would not fit (4 GiB).
-pub fn encode_model(coarse: &[u8], fine: &[Vec<u8>], settings: &Settings) -> Result<Vec<u8>, ModelError> {
+pub fn encode_model(networks: &Networks, settings: &Settings) -> Result<Vec<u8>, ModelError> {
     let unfit = |reason: String| ModelError::Header {
         file: "to be written".into(),
         reason,
     };
-    let mut networks = vec![Entry {
-        name: "coarse".into(),
-        bytes: coarse.len(),
-    }];
-    networks.extend(fine.iter().enumerate().map(|(i, blob)| Entry {
-        name: format!("fine{i}"),
+    let named = networks.named();
+    let entries = named.iter().map(|(name, blob)| Entry {
+        name: name.clone(),
         bytes: blob.len(),
-    }));
+    });
     let header = Header {
-        networks,
+        networks: entries.collect(),
         settings: settings.clone(),
     };
     let header = serde_json::to_vec(&header).map_err(|e| unfit(e.to_string()))?;
     let length = u32::try_from(header.len()).map_err(|e| unfit(e.to_string()))?;
     let mut bytes = MAGIC.to_vec();
-    bytes.push(VERSION);
+    bytes.push(match networks.close {
+        Some(_) => VERSION_CLOSE,
+        None => VERSION,
+    });
     bytes.extend(length.to_le_bytes());
     bytes.extend(header);
-    bytes.extend(coarse);
-    bytes.extend(fine.iter().flatten());
+    bytes.extend(named.iter().flat_map(|(_, blob)| *blob));
     Ok(bytes)
 }
 
-/// The networks' bytes and the settings of a model file, by name: for tools that take it apart.
+/// The networks and the settings of a model file.
 ///
 /// # Errors
 /// A [`ModelError`] that names `file`.
-pub fn decode_model(bytes: &[u8], file: &str) -> Result<(BTreeMap<String, Vec<u8>>, Settings), ModelError> {
+pub fn decode_model(bytes: &[u8], file: &str) -> Result<(Networks, Settings), ModelError> {
     let (header, mut rest) = split(bytes, file)?;
-    let mut networks = BTreeMap::new();
+    let mut networks = Networks::default();
     for entry in header.networks {
         let (blob, tail) = rest.split_at(entry.bytes);
-        networks.insert(entry.name, blob.to_vec());
         rest = tail;
+        match entry.name.as_str() {
+            COARSE => networks.coarse = blob.to_vec(),
+            CLOSE => networks.close = Some(blob.to_vec()),
+            _ => networks.fine.push(blob.to_vec()),
+        }
+    }
+    if networks.coarse.is_empty() || networks.fine.is_empty() {
+        return Err(ModelError::Header {
+            file: file.into(),
+            reason: "it lists no coarse network or no fine one".into(),
+        });
     }
     Ok((networks, header.settings))
 }
@@ -406,7 +473,7 @@ fn split<'a>(bytes: &'a [u8], file: &str) -> Result<(Header, &'a [u8]), ModelErr
     if bytes.len() < PREAMBLE || &bytes[..7] != MAGIC {
         return Err(ModelError::NotAModel { file: file() });
     }
-    if bytes[7] != VERSION {
+    if ![VERSION, VERSION_CLOSE].contains(&bytes[7]) {
         let found = char::from(bytes[7]);
         return Err(ModelError::Version { file: file(), found });
     }
@@ -456,10 +523,8 @@ mod tests {
         let model = Model::embedded()?;
         assert!(model.id().starts_with("sha256:") && model.id().len() == 71);
         let (networks, settings) = decode_model(EMBEDDED_MODEL, "m.unscrew")?;
-        let fine: Vec<_> = (0..model.fine.len())
-            .map(|i| networks[&format!("fine{i}")].clone())
-            .collect();
-        let again = encode_model(&networks["coarse"], &fine, &settings)?;
+        let again = encode_model(&networks, &settings)?;
+        assert_eq!(decode_model(&again, "again")?.0, networks);
         assert_eq!(Model::from_bytes(&again)?.settings, model.settings);
         assert_eq!(model_id(&again).len(), 71);
         Ok(())
@@ -477,10 +542,19 @@ mod tests {
         let mut scrambled = EMBEDDED_MODEL.to_vec();
         scrambled[PREAMBLE] = b'?';
         assert!(message(&scrambled).contains("header of the model m.unscrew"));
-        let (mut networks, settings) = decode_model(EMBEDDED_MODEL, "m").expect("the built-in model");
-        let coarse = networks.remove("coarse").expect("a coarse network");
-        let swapped = encode_model(&coarse, std::slice::from_ref(&coarse), &settings).expect("fits");
+        let (networks, settings) = decode_model(EMBEDDED_MODEL, "m").expect("the built-in model");
+        let swapped = Networks {
+            fine: vec![networks.coarse.clone()],
+            ..networks.clone()
+        };
+        let swapped = encode_model(&swapped, &settings).expect("fits");
         assert!(message(&swapped).contains("network fine0 of the model m.unscrew has 3 input and 2 output channels"));
+        let none = Networks {
+            fine: Vec::new(),
+            ..networks
+        };
+        let none = encode_model(&none, &settings).expect("fits");
+        assert!(message(&none).contains("no coarse network or no fine one"));
         let missing = Model::load(Path::new("/nowhere/m.unscrew")).expect_err("is not there");
         assert!(missing.to_string().contains("/nowhere/m.unscrew"));
     }

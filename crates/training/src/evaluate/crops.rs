@@ -7,7 +7,8 @@ use geometry::{Pixel, Rate, RgbImage};
 use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
 use serde::{Deserialize, Serialize};
-use vision::{Detector, look};
+use vision::layout::CLOSE_HEAD_PX;
+use vision::{Detector, Evidence, look};
 
 use super::{EvaluateError, Share};
 use crate::real;
@@ -31,15 +32,25 @@ pub struct CropEvaluation {
 pub fn evaluate_crops(detector: &Detector, data: &Path) -> Result<CropEvaluation, EvaluateError> {
     let mut rng = Pcg64Mcg::seed_from_u64(1);
     let (mut fasteners, mut others) = (Share::default(), Share::default());
-    for patch in real::crops(data, true, &mut rng)? {
+    let settings = &detector.model().settings;
+    // as large as a picture's heads are made that is searched at several scales
+    for patch in real::crops(data, true, CLOSE_HEAD_PX..=CLOSE_HEAD_PX, &mut rng)? {
         let side = PATCH_PX as u32;
         let (Some(label), Some(picture)) = (patch.labels.first(), RgbImage::from_raw(side, side, patch.rgb.clone()))
         else {
             continue;
         };
         let place = Pixel::new(f64::from(label.u_px), f64::from(label.v_px));
-        let evidence = look(&detector.model().fine, &picture, &[place])?;
-        let called = evidence.iter().any(|e| e.fastener() >= 0.5);
+        let evidence = look(
+            &detector.model().fine,
+            detector.model().close.as_ref(),
+            &picture,
+            &[place],
+        )?;
+        let probability = |e: &Evidence| settings.corrections.probability(f64::from(e.fastener()), None);
+        let called = evidence
+            .iter()
+            .any(|e| probability(e) >= f64::from(settings.thresholds.other));
         if label.classes == any_fastener() {
             fasteners.add(called);
         } else {
