@@ -319,33 +319,28 @@ fn cue_factors(model: &Model, shots: &[Shot], corrections: &mut Corrections) -> 
         corrections.relief_below_rim = relief;
     }
     let below = [learned, circle, cross, relief];
-    // errors along the axes without the parallax, in units that depend on the cue
-    let rest = |cue: usize, ratio: &dyn Fn(f64, &CueError) -> f64| -> Vec<f64> {
-        let of = |e: &CueError| [0, 1].map(|k| ratio((e.off_px[k] - below[cue] * e.parallax_px[k]).abs(), e));
+    // errors along the axes without the parallax, each with the centre that it is of
+    let rests: [Vec<(f64, &CueError)>; 4] = std::array::from_fn(|cue| {
+        let of = |e| [0, 1].map(|k| (off_axis_px(e, below[cue], k), e));
         cues[cue].iter().flat_map(of).collect()
-    };
-    corrections.learned_sigma = one_sigma(rest(0, &|off_px, e| off_px / e.sigma_px));
-    corrections.cross_sigma = one_sigma(rest(2, &|off_px, e| off_px / e.sigma_px));
+    });
+    let in_sigmas = |cue: usize| one_sigma(rests[cue].iter().map(|(off_px, e)| off_px / e.sigma_px).collect());
+    (corrections.learned_sigma, corrections.cross_sigma) = (in_sigmas(0), in_sigmas(2));
     // what is seen best is still off by as much as recesses are eccentric; the rest by what it says beyond that
     let outlined = |cue: usize| {
         let half = median(cues[cue].iter().map(|e| e.sigma_px).collect());
-        let some = |is_sure: bool, ratio: &dyn Fn(f64, &CueError) -> f64| -> Vec<f64> {
-            let some = |off_px: f64, e: &CueError| {
-                if (e.sigma_px <= half) == is_sure {
-                    ratio(off_px, e)
-                } else {
-                    f64::NAN
-                }
-            };
-            rest(cue, &some).into_iter().filter(|ratio| !ratio.is_nan()).collect()
+        let (sure, others): (Vec<_>, Vec<_>) = rests[cue].iter().partition(|(_, e)| e.sigma_px <= half);
+        if sure.len() < ENOUGH {
+            return None;
+        }
+        let floor = quantile(
+            sure.iter().map(|(off_px, e)| off_px / e.diameter_px).collect(),
+            ONE_SIGMA,
+        );
+        let beyond = |(off_px, e): &(f64, &CueError)| {
+            (off_px.powi(2) - (floor * e.diameter_px).powi(2)).max(0.0).sqrt() / e.sigma_px
         };
-        let sure = some(true, &|off_px, e| off_px / e.diameter_px);
-        let floor = (sure.len() >= ENOUGH).then(|| quantile(sure, ONE_SIGMA))?;
-        let beyond = |off_px: f64, e: &CueError| (off_px.powi(2) - (floor * e.diameter_px).powi(2)).max(0.0).sqrt();
-        Some([
-            floor,
-            one_sigma(some(false, &|off_px, e| beyond(off_px, e) / e.sigma_px)),
-        ])
+        Some([floor, one_sigma(others.iter().map(beyond).collect())])
     };
     if let Some(factors) = outlined(1) {
         [corrections.eccentricity, corrections.circle_sigma] = factors;
@@ -354,6 +349,11 @@ fn cue_factors(model: &Model, shots: &[Shot], corrections: &mut Corrections) -> 
         [corrections.relief_floor, corrections.relief_sigma] = factors;
     }
     Ok(())
+}
+
+/// How far a cue is off along an axis, without the parallax of what lies so far below the rim, px.
+fn off_axis_px(error: &CueError, below_rim: f64, axis: usize) -> f64 {
+    (error.off_px[axis] - below_rim * error.parallax_px[axis]).abs()
 }
 
 /// Weights of what stereo measures around a recess, and how far the rim's true height is off what they give.

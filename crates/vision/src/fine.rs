@@ -374,6 +374,35 @@ mod tests {
     }
 
     #[test]
+    fn a_closer_look_speaks_of_the_same_pixels() {
+        let model = crate::Model::embedded().expect("the built-in model");
+        let close = model.close.as_ref().expect("it looks closer");
+        for (k, diameter_px) in [22.0, 28.0, 38.0].into_iter().enumerate() {
+            let screw = crate::synthetic::Screw {
+                at: Pixel::new(80.3, 71.8),
+                diameter_px,
+                noise: 0.02,
+                seed: k as u64,
+                ..Default::default()
+            };
+            let picture = crate::synthetic::draw(160, 150, &[screw]);
+            let place = Place {
+                center: Pixel::new(81.0, 71.0),
+                scale: Some(CLOSE_HEAD_PX / diameter_px),
+            };
+            for sign in VIEWS {
+                let seen = &look_once(std::slice::from_ref(close), &picture, &[place], sign).expect("own kernels")[0];
+                let off_px = seen.center.distance_px(&Pixel::new(80.3, 71.8));
+                assert!(off_px < 0.06 * diameter_px, "{diameter_px} {sign:?}: off by {off_px}");
+                assert!(
+                    (seen.diameter_px / diameter_px - 1.0).abs() < 0.2,
+                    "{diameter_px}: {seen:?}"
+                );
+            }
+        }
+    }
+
+    #[test]
     fn nothing_there_is_background() {
         let mut nothing = vec![0f32; MAP_CELLS * MAP_CELLS * FINE_CHANNELS];
         nothing.chunks_exact_mut(FINE_CHANNELS).for_each(|cell| cell[0] = 1.0);
