@@ -62,7 +62,7 @@ pub struct DecoyRow {
     pub false_finds: usize,
 }
 
-/// How well the drive of fasteners that the cross bit does not fit is told.
+/// How well the drive of fasteners is told.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct DriveRow {
     /// How many show.
@@ -152,10 +152,12 @@ pub struct Evaluation {
     pub by_face: BTreeMap<String, Rate>,
     /// What became of everything else, by kind.
     pub by_decoy: BTreeMap<String, DecoyRow>,
-    /// Other drives, by drive.
+    /// Fasteners by drive: the detectable cross screws, and the others that show.
     pub by_drive: BTreeMap<String, DriveRow>,
-    /// Reported fasteners of other drives whose drive is right.
+    /// Of the reported fasteners, those whose drive is right.
     pub drive_right: Rate,
+    /// The same of those that the cross bit does not fit.
+    pub other_drive_right: Rate,
     /// Probabilities of a cross screw as said, beside what is so.
     pub reliability: Vec<ReliabilityBin>,
     /// What other thresholds would give.
@@ -328,7 +330,10 @@ impl<'a> Evaluator<'a> {
         let mut relative = centers(|e| e.u_px / e.sigma_px);
         relative.extend(centers(|e| e.v_px / e.sigma_px));
         let (found, detectable) = (t.recall.hits, t.recall.of);
-        let drives = |f: fn(&DriveRow) -> usize| t.by_drive.values().map(f).sum();
+        let drives = |is_asked: fn(&str) -> bool| {
+            let rows = || t.by_drive.iter().filter(|(name, _)| is_asked(name)).map(|(_, row)| row);
+            Rate::of(rows().map(|d| d.right).sum(), rows().map(|d| d.found).sum())
+        };
         Evaluation {
             source: self.source,
             model: self.detector.model().id().to_owned(),
@@ -362,7 +367,8 @@ impl<'a> Evaluator<'a> {
             without_depth: t.without_depth,
             sigma: Coverage::of(&relative),
             depth_sigma: Coverage::of(&spaces(|e| e.mm[2] / e.sigma_depth_mm)),
-            drive_right: Rate::of(drives(|d| d.right), drives(|d| d.found)),
+            drive_right: drives(|_| true),
+            other_drive_right: drives(|name| name != Drive::Cross.name()),
             timing_ms: Timing {
                 decode: timings(|t| t.decode),
                 coarse: timings(|t| t.coarse),
@@ -569,6 +575,7 @@ impl Tally {
         let hit = find.filter(|f| f.verdict == Verdict::Screw);
         let found = hit.is_some();
         self.recall.add(found);
+        self.drive(Drive::Cross, find);
         if let Some(candidate) = candidate {
             self.stage_one.get_or_insert_default().add(candidate);
         }
@@ -624,11 +631,16 @@ impl Tally {
             None => row.dropped += 1,
         }
         if let Some(drive) = decoy.drive() {
-            let row = self.by_drive.entry(drive.name().into()).or_default();
-            row.n += 1;
-            row.found += usize::from(find.is_some());
-            row.right += usize::from(find.is_some_and(|f| f.drive == drive));
+            self.drive(drive, find);
         }
+    }
+
+    /// A fastener of a drive and the find that speaks for it.
+    fn drive(&mut self, drive: Drive, find: Option<&Screw>) {
+        let row = self.by_drive.entry(drive.name().into()).or_default();
+        row.n += 1;
+        row.found += usize::from(find.is_some());
+        row.right += usize::from(find.is_some_and(|f| f.drive == drive));
     }
 }
 
@@ -876,12 +888,13 @@ impl Display for Evaluation {
             writeln!(
                 f,
                 "\n{:<22} {:>6} {:>6} {:>12}",
-                "other drives", "n", "found", "drive right"
+                "fasteners by drive", "n", "found", "drive right"
             )?;
             for (name, d) in &self.by_drive {
                 writeln!(f, "  {name:<20} {:>6} {:>6} {:>12}", d.n, d.found, d.right)?;
             }
             writeln!(f, "  right of found {}", self.drive_right)?;
+            writeln!(f, "  without cross  {}", self.other_drive_right)?;
         }
         write_lists(f, &self.misses, &self.false_list)?;
         let t = &self.timing_ms;
@@ -989,7 +1002,9 @@ mod tests {
         assert_eq!((e.by_decoy["rivet"].n, e.by_decoy["rivet"].false_finds), (0, 1));
         let drive = |name: &str| (e.by_drive[name].n, e.by_drive[name].found, e.by_drive[name].right);
         assert_eq!((drive("hex_head"), drive("slotted")), ((2, 2, 1), (1, 1, 0)));
-        assert_eq!((e.drive_right.hits, e.drive_right.of), (1, 3));
+        assert_eq!(drive("cross"), (5, 3, 2));
+        assert_eq!((e.drive_right.hits, e.drive_right.of), (3, 6));
+        assert_eq!((e.other_drive_right.hits, e.other_drive_right.of), (1, 3));
         assert_eq!(
             (e.by_wear["rust"].hits, e.by_wear["rust"].of, e.by_wear["clean"].of),
             (0, 3, 2)
