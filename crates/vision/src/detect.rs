@@ -462,9 +462,7 @@ impl Detector {
         let seen = calibrated(probability(options.bit));
         let fits = options.odds * seen / (options.odds * seen + 1.0 - seen);
         let t = &settings.thresholds;
-        // what is likelier another drive's is not acted on, however little a false find costs; odds may make it the likelier one all the same
-        let is_likeliest = likeliest == options.bit || fits >= 0.5;
-        let (verdict, score) = if fits >= f64::from(t.accept) && is_likeliest {
+        let (verdict, score) = if fits >= f64::from(t.accept) {
             (Verdict::Screw, fits)
         } else if fits >= f64::from(t.review) {
             (Verdict::Review, fits)
@@ -643,18 +641,11 @@ mod tests {
         assert_eq!(verdict(0.45, 0.1, Drive::Cross), Some((Verdict::Review, Drive::Cross)));
         assert_eq!(verdict(0.29, 0.28, Drive::Cross), Some((Verdict::Other, Drive::Cross)));
         assert_eq!(verdict(0.05, 0.1, Drive::Cross), None);
-        // a false find may cost so little that less than half suffices: not where another drive is likelier
-        let mut bold = detector.model().clone();
-        bold.settings.thresholds.accept = 0.33;
-        let bold = Detector::new(bold);
-        let verdict = |cross, slotted| bold.tell(&find(50.0, 30.0, cross, slotted), None, &Options::default());
-        assert_eq!(verdict(0.45, 0.1).map(|t| t.verdict), Some(Verdict::Screw));
-        assert_eq!(verdict(0.45, 0.5).map(|t| t.verdict), Some(Verdict::Review));
         let stuck = Options {
             odds: 150.0,
             ..Options::default()
         };
-        let told = bold.tell(&find(50.0, 30.0, 0.05, 0.9), None, &stuck);
+        let told = detector.tell(&find(50.0, 30.0, 0.05, 0.9), None, &stuck);
         assert_eq!(told.map(|t| t.verdict), Some(Verdict::Screw)); // a cover that stays speaks for it
         Ok(())
     }
