@@ -169,7 +169,7 @@ distance, not to claim it.</p>",
         page,
         "<h2>Unit by unit</h2><div class=\"key\"><span><i style=\"border-color:{REMOVED}\"></i>taken out</span><span><i style=\"border-color:{FAILED}\"></i>attempted, still there</span>\
 <span><i style=\"border-color:{REVIEW}\"></i>for a person to look at</span><span><i style=\"border-color:{OTHER}\"></i>other fastener or out of range: left alone</span>\
-<span><i style=\"border-color:{MISSED}\"></i>missed (known from the simulator's truth only)</span></div>"
+<span><i style=\"border-color:{MISSED}\"></i>missed; dashed: hidden (known from the simulator's truth only)</span></div>"
     )?;
     Ok(())
 }
@@ -306,7 +306,7 @@ fn figure(
         let r = m.diameter_px.max(32.0);
         write!(
             page,
-            "<rect x=\"{:.1}\" y=\"{:.1}\" width=\"{:.1}\" height=\"{:.1}\" fill=\"none\" stroke=\"{MISSED}\" stroke-width=\"12\"{}><title>missed{}</title></rect>",
+            "<rect x=\"{:.1}\" y=\"{:.1}\" width=\"{:.1}\" height=\"{:.1}\" fill=\"none\" stroke=\"{MISSED}\" stroke-width=\"12\"{}><title>{}</title></rect>",
             m.u_px - r,
             m.v_px - r,
             2.0 * r,
@@ -316,7 +316,11 @@ fn figure(
             } else {
                 " stroke-dasharray=\"20 14\""
             },
-            if m.detectable { "" } else { ": slot or head not visible" },
+            if m.detectable {
+                "missed"
+            } else {
+                "hidden: too little of its head or slot shows"
+            },
         )?;
     }
     let targets = face.attempts.len();
@@ -324,7 +328,7 @@ fn figure(
     let review = face.found.iter().filter(|f| f.verdict == Verdict::Review).count();
     write!(
         page,
-        "</svg><figcaption><b>{}</b> · {} · {} of {targets} screws out{}{}{}{}</figcaption>",
+        "</svg><figcaption><b>{}</b> · {} · {} of {targets} screws out{}{}{}{}{}</figcaption>",
         escape(&face.face.0.replace('_', " ")),
         match face.purpose {
             Purpose::Survey => "survey, nothing touched".into(),
@@ -335,21 +339,10 @@ fn figure(
             Purpose::Search => "searched around heads that were not met".into(),
         },
         face.removed(),
-        if retries > 0 {
-            format!(" · {retries} second attempts")
-        } else {
-            String::new()
-        },
-        if review > 0 {
-            format!(" · {review} for review")
-        } else {
-            String::new()
-        },
-        if missed.is_empty() {
-            String::new()
-        } else {
-            format!(" · {} missed", missed.len())
-        },
+        counted(retries, "second attempts"),
+        counted(review, "for review"),
+        counted(missed.iter().filter(|m| m.detectable).count(), "missed"),
+        counted(missed.iter().filter(|m| !m.detectable).count(), "hidden"),
         face.plane
             .map_or(String::new(), |p| format!(" · tilt {:.1}°", p.tilt_rad.to_degrees())),
     )?;
@@ -376,6 +369,15 @@ fn figure(
     }
     page.push_str("</figure>");
     Ok(())
+}
+
+/// Part of a caption; nothing where there is none.
+fn counted(count: usize, what: &str) -> String {
+    if count > 0 {
+        format!(" · {count} {what}")
+    } else {
+        String::new()
+    }
 }
 
 fn word(verdict: Verdict) -> &'static str {

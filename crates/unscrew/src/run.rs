@@ -436,11 +436,10 @@ impl Observer for Live<'_> {
         let look = looks.entry(unit).or_default();
         if let Some(truth) = self.simulated.face_truth() {
             let missed = truth.screws.iter().filter(|s| {
-                s.visible_fraction > 0.2
-                    && !face.found.iter().any(|f| {
-                        f.verdict == Verdict::Screw
-                            && (f.u_px - s.pixel.u_px).hypot(f.v_px - s.pixel.v_px) < SAME * s.head_d_px
-                    })
+                !face.found.iter().any(|f| {
+                    f.verdict == Verdict::Screw
+                        && (f.u_px - s.pixel.u_px).hypot(f.v_px - s.pixel.v_px) < SAME * s.head_d_px
+                })
             });
             let missed: Vec<Missed> = missed
                 .map(|s| Missed {

@@ -28,6 +28,9 @@ const CLOSE: &str = "close";
 /// The model that ships with the program.
 pub static EMBEDDED_MODEL: &[u8] = include_bytes!("../models/default.unscrew");
 
+/// Below one half another drive may be likelier than the bit's: no model file makes the detector act on that.
+const LEAST_ACCEPT: f32 = 0.5;
+
 /// Limits between the verdicts; training sets them from the cost of a miss, a false find and a person's look.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
@@ -36,7 +39,7 @@ pub struct Thresholds {
     pub coarse: f32,
     /// Fewest coarse cells (16 px² each) of a candidate.
     pub coarse_min_cells: usize,
-    /// Probability of the mounted bit's drive from which the verdict is `screw`.
+    /// Probability of the mounted bit's drive from which the verdict is `screw`; a file's is raised to one half.
     pub accept: f32,
     /// From this up to `accept` the verdict is `review`; below, the candidate is dropped.
     pub review: f32,
@@ -442,7 +445,9 @@ pub fn encode_model(networks: &Networks, settings: &Settings) -> Result<Vec<u8>,
 /// # Errors
 /// A [`ModelError`] that names `file`.
 pub fn decode_model(bytes: &[u8], file: &str) -> Result<(Networks, Settings), ModelError> {
-    let (header, mut rest) = split(bytes, file)?;
+    let (mut header, mut rest) = split(bytes, file)?;
+    let thresholds = &mut header.settings.thresholds;
+    thresholds.accept = thresholds.accept.max(LEAST_ACCEPT);
     let mut networks = Networks::default();
     for entry in header.networks {
         let (blob, tail) = rest.split_at(entry.bytes);
@@ -527,6 +532,15 @@ mod tests {
         assert_eq!(decode_model(&again, "again")?.0, networks);
         assert_eq!(Model::from_bytes(&again)?.settings, model.settings);
         assert_eq!(model_id(&again).len(), 71);
+        Ok(())
+    }
+
+    #[test]
+    fn no_file_makes_the_detector_act_on_what_another_drive_may_be() -> Result<(), ModelError> {
+        let (networks, mut settings) = decode_model(EMBEDDED_MODEL, "m.unscrew")?;
+        settings.thresholds.accept = 0.4;
+        let bold = Model::from_bytes(&encode_model(&networks, &settings)?)?;
+        assert_eq!(bold.settings.thresholds.accept.to_bits(), LEAST_ACCEPT.to_bits());
         Ok(())
     }
 
