@@ -64,7 +64,7 @@ SHEETS = {
 NEGATIVES = {
     "slotted": 10, "hex_socket": 9, "torx": 8, "hex_bolt": 10, "hex_flange_bolt": 8,
     "rivet": 12, "hole": 5, "empty_screw_hole": 6, "plastic_cap": 7, "dimple": 5, "nut": 7,
-    "blob": 5, "printed_mark": 6, "cross_emboss": 6,
+    "blob": 5, "printed_mark": 9, "cross_emboss": 6, "button": 12,
 }
 SHEET_KINDS = ("hole", "empty_screw_hole", "dimple", "cross_emboss")
 MUDS = ((0.10, 0.065, 0.04), (0.20, 0.14, 0.09), (0.05, 0.042, 0.035), (0.26, 0.22, 0.17))
@@ -257,6 +257,18 @@ def bolt_profile(rng, kind, radius):
     return [(0, high, 0)] + edge
 
 
+def button_profile(rng, radius):
+    """Profile of a push button, flat or a little hollow, most with a collar around a gap."""
+    high, hollow = radius * rng.uniform(0.2, 0.8), radius * rng.uniform(-0.08, 0.12)
+    edge = rng.uniform(0.1, 0.5)
+    top = [(0, high - hollow, 0), (radius * 0.3, high - 0.9 * hollow, 0), (radius * 0.55, high - 0.6 * hollow, 0)]
+    if rng.random() < 0.3:
+        return top + [(radius - edge, high, 0), (radius, high - edge, 0), (radius, 0, 0)]
+    inner, collar = min(radius * rng.uniform(0.66, 0.84), radius - 1.0), high * rng.uniform(0.5, 1.2)
+    return top + [(inner - edge, high, 0), (inner, high - edge, 0), (inner, 0.2, 0), (inner + 0.35, 0.2, 0),
+                  (inner + 0.35, collar - 0.15, 0), (inner + 0.5, collar, 0), (radius - 0.2, collar, 0), (radius, collar - 0.2, 0), (radius, 0, 0)]
+
+
 # Recesses: depth in mm below the head's surface at each (x, y).
 
 
@@ -271,7 +283,7 @@ class Cross:
     """A cross recess of random make and wear."""
 
     def __init__(self, rng, head, narrow):
-        self.style = str(rng.choice(["phillips", "jis", "combination"], p=[0.55, 0.25, 0.20]))
+        self.style = str(rng.choice(["phillips", "jis", "combination", "pozidriv"], p=[0.52, 0.22, 0.16, 0.10]))
         self.reach = head * rng.uniform(0.42, 0.52 if narrow else 0.62) / 2
         self.width = self.reach * rng.uniform(0.22, 0.38)
         self.corner = self.width * rng.uniform(0.1, 0.95)
@@ -304,6 +316,10 @@ class Cross:
         if self.style == "combination":
             length, width, deep = self.slot
             depth = np.maximum(depth, np.minimum(bar_depth(x, y, length, width, 0.05, self.slope), deep))
+        if self.style == "pozidriv":  # marks between the wings
+            p, q = spin(x, y, math.pi / 4)
+            marks = np.maximum(bar_depth(p, q, self.reach * 1.1, 0.16, 0.02, 3), bar_depth(q, p, self.reach * 1.1, 0.16, 0.02, 3))
+            depth = np.maximum(depth, np.minimum(marks, 0.2))
         depth = soft_max(depth, self.round)
         level = self.depth * (1 - self.fill) if self.fill else 9.0
         return np.minimum(depth, level), step(level - 0.05, level + 0.05, depth)
@@ -326,6 +342,72 @@ def negative_recess(rng, kind, radius):
     size, lobes = radius * rng.uniform(0.36, 0.5), rng.uniform(0.10, 0.15)
     return lambda x, y: np.minimum(
         (size * (1 + lobes * np.cos(6 * np.arctan2(y, x))) - np.hypot(x, y)) * slope, deep)
+
+
+# Signs, as they are printed or moulded: how far inside of its ink a point is, in mm.
+
+
+def ring_sign(radius, line):
+    return lambda x, y: line / 2 - np.abs(np.hypot(x, y) - radius)
+
+
+def frame(rng, radius):
+    """A ring or a rectangle around a sign."""
+    line = radius * rng.uniform(0.06, 0.16)
+    if rng.random() < 0.6:
+        return ring_sign(radius * 0.95, line)
+    half = radius * np.array([rng.uniform(0.6, 0.8), rng.uniform(0.6, 0.8)])
+    return lambda x, y: line / 2 - np.abs(np.maximum(np.abs(x) - half[0], np.abs(y) - half[1]))
+
+
+def stroke(x, y, ends, line):
+    """Inside a straight line with round ends."""
+    ends = np.array(ends, float)
+    way = ends[1] - ends[0]
+    along = np.clip(((x - ends[0, 0]) * way[0] + (y - ends[0, 1]) * way[1]) / (way @ way), 0, 1)
+    return line / 2 - np.hypot(x - ends[0, 0] - along * way[0], y - ends[0, 1] - along * way[1])
+
+
+# Strokes in a box of -1 to 1; `power` and `turn` have an arc beside them.
+SIGNS = {
+    "plus": [((-1, 0), (1, 0)), ((0, -1), (0, 1))],
+    "minus": [((-1, 0), (1, 0))],
+    "times": [((-0.8, -0.8), (0.8, 0.8)), ((-0.8, 0.8), (0.8, -0.8))],
+    "up": [((-0.8, -0.4), (0, 0.6)), ((0, 0.6), (0.8, -0.4))],
+    "arrow": [((0, -1), (0, 1)), ((0, 1), (-0.5, 0.4)), ((0, 1), (0.5, 0.4))],
+    "four": [((-1, 0), (1, 0)), ((0, -1), (0, 1))] + [
+        ((a, b), (a * 0.7 + 0.25 * c * b, b * 0.7 + 0.25 * c * a)) for a, b in ((1, 0), (-1, 0), (0, 1), (0, -1)) for c in (1, -1)],
+    "play": [((-0.6, -0.8), (-0.6, 0.8)), ((-0.6, 0.8), (0.8, 0)), ((0.8, 0), (-0.6, -0.8))],
+    "pause": [((-0.4, -0.8), (-0.4, 0.8)), ((0.4, -0.8), (0.4, 0.8))],
+    "menu": [((-0.8, h), (0.8, h)) for h in (-0.6, 0, 0.6)],
+    "ground": [((0, 1), (0, 0)), ((-0.9, 0), (0.9, 0)), ((-0.6, -0.4), (0.6, -0.4)), ((-0.25, -0.8), (0.25, -0.8))],
+    "power": [((0, 0.1), (0, 1.1))],
+    "turn": [((-0.95, 0.25), (-0.6, 0.75)), ((-0.35, 0.3), (-0.95, 0.25))],
+    "dot": [((-0.05, 0), (0.05, 0))],
+    "H": [((-0.6, -1), (-0.6, 1)), ((0.6, -1), (0.6, 1)), ((-0.6, 0), (0.6, 0))],
+    "T": [((-0.8, 1), (0.8, 1)), ((0, 1), (0, -1))],
+    "A": [((-0.7, -1), (0, 1)), ((0, 1), (0.7, -1)), ((-0.4, -0.3), (0.4, -0.3))],
+    "4": [((0.4, -1), (0.4, 1)), ((0.4, 1), (-0.7, -0.3)), ((-0.7, -0.3), (0.8, -0.3))],
+    "8": [((-0.5, -0.9), (0.5, -0.9)), ((-0.5, 0), (0.5, 0)), ((-0.5, 0.9), (0.5, 0.9)), ((-0.6, -0.9), (-0.6, 0.9)), ((0.6, -0.9), (0.6, 0.9))],
+    "sun": [((0.55 * math.cos(a), 0.55 * math.sin(a)), (math.cos(a), math.sin(a))) for a in np.arange(8) * math.pi / 4],
+}
+
+
+def sign(rng, radius, crosses=False):
+    """A sign of about the given radius; a cross only where it lies flat, since raised or sunk it may as well be a recess."""
+    names = [name for name in SIGNS if crosses or name not in ("plus", "times", "four")]
+    name = "plus" if crosses and rng.random() < 0.3 else pick(rng, names)
+    line = radius * rng.uniform(0.14, 0.42)
+    strokes = [np.array(ends) * radius for ends in SIGNS[name]]
+
+    def inside(x, y):
+        shade = np.max([stroke(x, y, ends, line) for ends in strokes], axis=0)
+        if name in ("power", "turn"):
+            gap = np.abs(np.arctan2(x, y)) > 0.6
+            shade = np.maximum(shade, np.where(gap, line / 2 - np.abs(np.hypot(x, y) - 0.8 * radius), -9.0))
+        return shade
+    turn = rng.uniform(-0.2, 0.2) + rng.choice([0, math.pi / 2, rng.uniform(0, 6.28)], p=[0.6, 0.15, 0.25])
+    return lambda x, y: inside(*spin(x, y, turn))
 
 
 # Surfaces.
@@ -488,16 +570,18 @@ class Sheet:
         self.paint(window, strength * np.maximum(ring, run * rng.random()), colour, 0.85)
 
     def mark(self, x, y, radius):
-        """A flat printed plus, plus in a circle, or ring."""
+        """A printed sign, bare, in a frame, on a disc, or a ring alone."""
         rng = self.rng
         window, dx, dy = self.around(x, y, radius + 2)
-        r = np.hypot(dx, dy)
-        px, py = spin(dx, dy, rng.uniform(-0.8, 0.8) * (rng.random() < 0.5))
-        shape, line = int(rng.integers(3)), radius * rng.uniform(0.06, 0.16)
-        arm = radius * (0.95 if shape == 0 else 0.6)
-        plus = np.maximum(bar_depth(px, py, arm, line, 0.02, 1), bar_depth(py, px, arm, line, 0.02, 1))
-        ring = line / 2 - np.abs(r - radius + line)
-        shade = (plus, np.maximum(plus, ring), ring)[shape]
+        kind = str(rng.choice(["bare", "framed", "disc", "ring"]))
+        if kind == "bare":
+            shade = sign(rng, radius * 0.9, True)(dx, dy)
+        elif kind == "framed":
+            shade = np.maximum(frame(rng, radius)(dx, dy), sign(rng, radius * rng.uniform(0.4, 0.6), True)(dx, dy))
+        elif kind == "disc":
+            shade = np.minimum(radius - np.hypot(dx, dy), -sign(rng, radius * rng.uniform(0.4, 0.65), True)(dx, dy))
+        else:
+            shade = ring_sign(radius * 0.95, radius * rng.uniform(0.05, 0.15))(dx, dy)
         wear = step(-2.2, -1.4, self.noise(dx, dy, 2) + rng.uniform(-0.6, 1))
         ink = pick(rng, [(0.03, 0.03, 0.03), (0.35, 0.03, 0.03), (0.03, 0.08, 0.3), (0.75, 0.75, 0.75)])
         if abs(float(np.mean(ink)) - float(self.base.mean())) < 0.15:
@@ -557,7 +641,7 @@ class Camera:
     """A pinhole looking at the middle of the sheet."""
 
     def __init__(self, rng):
-        tilt = math.radians(rng.uniform(8, 25) if rng.random() < 0.15 else rng.uniform(0, 6))
+        tilt = math.radians(rng.uniform(8, 40) if rng.random() < 0.3 else rng.uniform(0, 6))
         toward = rng.uniform(0, 2 * math.pi)
         lean = axis_turn("Z", toward) @ axis_turn("X", tilt) @ axis_turn("Z", -toward)
         self.turn = lean @ axis_turn("Z", math.radians(rng.uniform(-4, 4)))
@@ -668,6 +752,8 @@ def negative_shape(rng, kind, radius):
         return profile, lambda x, y: np.minimum((pin - np.hypot(x, y)) * 7, deep)
     if kind == "plastic_cap":
         return dome(radius, radius * rng.uniform(0.3, 0.9), rng.uniform(2, 4), base=0.3) + [(radius, 0, 0)], flat
+    if kind == "button":
+        return button_profile(rng, radius), flat
     if kind == "blob":
         return dome(radius, radius * rng.uniform(0.15, 0.5), 2.0) + [(radius, -0.2, 0)], flat
     return bolt_profile(rng, kind, radius), flat
@@ -676,7 +762,7 @@ def negative_shape(rng, kind, radius):
 def add_solid(rng, noise, sheet, parts, kind, x0, y0, radius):
     """Anything that is not a cross-recessed screw and not part of the sheet itself."""
     wear, level = wear_level(rng)
-    pose = Pose(rng, x0, y0, radius, kind in ("blob", "plastic_cap", "rivet"))
+    pose = Pose(rng, x0, y0, radius, kind in ("blob", "plastic_cap", "button", "rivet"))
     profile, recess = negative_shape(rng, kind, radius)
     x, y, z = revolve(profile, rng.uniform(0, 1))
     if kind == "blob":
@@ -685,6 +771,10 @@ def add_solid(rng, noise, sheet, parts, kind, x0, y0, radius):
     depth = soft_max(recess(*spin(x, y, rng.uniform(0, 6.28))), 0.04)
     depth[-4:] = 0
     plating = choose_plating(rng)
+    if kind == "hex_bolt" and rng.random() < 0.5:
+        # what a maker's mark raises or sinks
+        mark = rng.uniform(0.08, 0.25) * rng.choice([-1, 1]) * step(-0.1, 0.1, sign(rng, radius * rng.uniform(0.3, 0.6))(x, y))
+        depth = depth + mark * (np.hypot(x, y) < 0.75 * radius)
     if kind == "blob":
         skin = Skin(noise, x, y, pick(rng, MUDS), 0.0, 0.95)
         skin.colour *= 1 + 0.2 * skin.fractal(1)[..., None]
@@ -693,6 +783,9 @@ def add_solid(rng, noise, sheet, parts, kind, x0, y0, radius):
         colour = pick(rng, [sheet.base, (0.02, 0.02, 0.02), (0.7, 0.7, 0.68), (0.3, 0.3, 0.3), (0.4, 0.05, 0.04), (0.05, 0.1, 0.4)])
         skin = Skin(noise, x, y, colour, 0.0, rng.uniform(0.25, 0.6))
         weather(rng, skin, "plastic", 0.5 * level, 0.0 * x, rim_mask(x, y, radius))
+    elif kind == "button":
+        skin, depth = button_skin(rng, noise, sheet, x, y, radius)
+        weather(rng, skin, "plastic", 0.4 * level, step(0.1, 0.4, depth), rim_mask(x, y, radius))
     else:
         skin = plated_skin(rng, noise, plating, sheet.base, x, y)
         if rng.random() < 0.3 * (0.4 + level):
@@ -700,6 +793,26 @@ def add_solid(rng, noise, sheet, parts, kind, x0, y0, radius):
         weather(rng, skin, plating, level, step(0.3, 1.5, depth), rim_mask(x, y, radius))
         sheet.halo(x0, y0, radius, level, PLATINGS[plating][3])
     add_item(parts, pose, x, y, z - depth, skin)
+
+
+def button_skin(rng, noise, sheet, x, y, radius):
+    """A button's surface with its sign, and the depth of a sign that is moulded."""
+    metal = rng.random() < 0.25
+    colour = np.array(pick(rng, [sheet.base, (0.02, 0.02, 0.02), (0.02, 0.02, 0.022), (0.75, 0.75, 0.73), (0.3, 0.3, 0.31), (0.15, 0.15, 0.16), (0.4, 0.05, 0.04), (0.05, 0.1, 0.4)]))
+    if metal:
+        colour = np.array((0.55, 0.55, 0.56)) * rng.uniform(0.5, 1.1)
+    skin = Skin(noise, x, y, colour, float(metal), rng.uniform(0.2, 0.6))
+    drawn = sign(rng, radius * rng.uniform(0.3, 0.6))(x, y)
+    if rng.random() < 0.3:
+        drawn = np.maximum(sign(rng, radius * rng.uniform(0.25, 0.35))(x, y), frame(rng, 0.6 * radius)(x, y))
+    on_top = np.hypot(x, y) < 0.64 * radius
+    ink = (0.75, 0.75, 0.75) if colour.mean() < 0.25 else pick(rng, [(0.02, 0.02, 0.02), (0.15, 0.15, 0.15), (0.4, 0.03, 0.03), (0.03, 0.08, 0.35)])
+    how = str(rng.choice(["printed", "moulded", "both", "none"], p=[0.5, 0.2, 0.15, 0.15]))
+    shade = step(-0.08, 0.08, drawn) * on_top
+    if how in ("printed", "both"):
+        skin.cover(shade * step(-2.4, -1.6, skin.fractal(1.5)), ink, 0.0, 0.5)
+    sunk = rng.uniform(0.1, 0.5) * rng.choice([1, 1, -1]) if how in ("moulded", "both") else 0.0
+    return skin, sunk * shade
 
 
 def add_negative(rng, noise, sheet, parts, cell, x0, y0):

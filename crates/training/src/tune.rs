@@ -20,6 +20,9 @@ const ENOUGH: usize = 20;
 const CUE_FACES: usize = 40;
 /// A cue farther off than this has met something else, in head diameters.
 const GROSS: f64 = 0.15;
+/// Sigma of the outer circle against what it is on our own pictures: on path-traced plates kept apart, where light and shadow are another
+/// renderer's, it is off by so much more than it says than the learned centre is (`docs/detection.md`).
+const OUTLINE_ELSEWHERE: f64 = 2.0;
 /// Scores below this are left out of the calibration: hundreds of candidates that are surely nothing would rule a curve that is there for
 /// the doubtful ones.
 const DOUBTFUL_FROM: f64 = 0.02;
@@ -169,7 +172,8 @@ fn coarse_threshold(peaks: &[f32]) -> Option<f32> {
 }
 
 /// [`Corrections::center_sigma`] under which errors along an axis (error, sigma of the fused cues, px; score) are likeliest, as ones
-/// with tails (Student's t, 4 degrees of freedom: a few gross ones do not rule), then scaled so that 68.3 % lie within it.
+/// with tails (Student's t, 4 degrees of freedom: a few gross ones do not rule), then scaled so
+/// that the shares within it and within 1.96 of it are off alike from a normal distribution's.
 fn center_sigma(errors: &[(f64, f64, f64)]) -> [f64; 3] {
     let start = Corrections::default().center_sigma;
     if errors.len() < ENOUGH {
@@ -191,8 +195,11 @@ fn center_sigma(errors: &[(f64, f64, f64)]) -> [f64; 3] {
         };
         weights -= (inverse * slope).map(|step| step.clamp(-0.5, 0.5));
     }
+    // errors have longer tails than a normal distribution's: one sigma and 1.96 of it are to be off alike
     let ratio = |error: &(f64, f64, f64)| error.0 / weights.dot(&terms(error)).exp();
-    weights.x += one_sigma(errors.iter().map(ratio).collect()).ln();
+    let ratios: Vec<f64> = errors.iter().map(ratio).collect();
+    let two_sigma = quantile(ratios.clone(), 0.95) / 1.96;
+    weights.x += 0.5 * (one_sigma(ratios).ln() + two_sigma.max(0.1).ln());
     weights.into()
 }
 
@@ -344,7 +351,7 @@ fn cue_factors(model: &Model, shots: &[Shot], corrections: &mut Corrections) -> 
         Some([floor, one_sigma(others.iter().map(beyond).collect())])
     };
     if let Some(factors) = outlined(1) {
-        [corrections.eccentricity, corrections.circle_sigma] = factors;
+        [corrections.eccentricity, corrections.circle_sigma] = factors.map(|factor| OUTLINE_ELSEWHERE * factor);
     }
     if let Some(factors) = outlined(3) {
         [corrections.relief_floor, corrections.relief_sigma] = factors;
