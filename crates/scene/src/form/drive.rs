@@ -1,7 +1,7 @@
 //! Fasteners that another bit drives.
 
 use super::head::{HeadShape, Profile, head_shape, hex_top, hexagon, marks};
-use super::{Form, Spot, between, grey, matt, plating, seat, segment};
+use super::{Form, Spot, between, grey, matt, plating, seat, segment, washer_plating};
 use crate::bake::SheetFinish;
 use crate::fastener::{Decoy, Head, Item, Plating};
 use crate::noise::{Grain, Noise, smoothstep};
@@ -190,11 +190,7 @@ pub(super) fn driven(item: &Item, decoy: Decoy, sheet: &SheetFinish, rng: &mut P
     let side = 7.0 - 4.0 * worn;
     let ragged = Noise::new(Grain::Cloud, 1.8, rng);
     let rim_mm = base + shape.top(0.0, 0.0).map_or(1.0, |s| s.0);
-    let washer = if rng.random_bool(0.7) {
-        main
-    } else {
-        plating(Plating::Zinc, sheet, rng)
-    };
+    let washer = washer_plating(main, sheet, rng);
     Form {
         materials: vec![main, washer, matt(grey(0.02), 0.8)],
         rim_mm,

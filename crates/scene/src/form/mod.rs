@@ -142,6 +142,15 @@ pub(crate) fn plating(kind: Plating, sheet: &SheetFinish, rng: &mut Pcg64Mcg) ->
     }
 }
 
+/// A pressed-on washer has its head's plating, or zinc.
+fn washer_plating(head: Material, sheet: &SheetFinish, rng: &mut Pcg64Mcg) -> Material {
+    if rng.random_bool(0.7) {
+        head
+    } else {
+        plating(Plating::Zinc, sheet, rng)
+    }
+}
+
 /// Form pressed into the sheet under an item.
 #[derive(Clone, Copy)]
 enum Seat {

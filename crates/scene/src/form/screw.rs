@@ -1,9 +1,9 @@
 //! Screws with a cross recess.
 
 use super::head::{head_shape, marks};
-use super::{Form, Spot, between, grey, matt, plating, seat};
+use super::{Form, Spot, between, grey, matt, plating, seat, washer_plating};
 use crate::bake::SheetFinish;
-use crate::fastener::{CrossRecess, Head, Item, Plating};
+use crate::fastener::{CrossRecess, Head, Item};
 use crate::noise::{Grain, Noise, smoothstep};
 use rand::RngExt;
 use rand_pcg::Pcg64Mcg;
@@ -138,11 +138,7 @@ pub(super) fn screw(
     let swell = between(rng, 0.0, 0.05);
     // The rim of the recess lies where the wings end, a little below a dome's top.
     let rim_mm = base + shape.top(ox + 0.35 * width, oy).map_or(top, |s| s.0);
-    let washer = if rng.random_bool(0.7) {
-        main
-    } else {
-        plating(Plating::Zinc, sheet, rng)
-    };
+    let washer = washer_plating(main, sheet, rng);
     Form {
         materials: vec![main, washer, matt(grey(0.02), 0.8)],
         rim_mm,
